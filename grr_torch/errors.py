@@ -1,0 +1,124 @@
+"""Exceptions and warnings: each says what was wrong, what was given and what would be valid.
+
+Every exception keeps these as fields, so that a program can act on them without parsing the text.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+
+
+class GrrError(Exception):
+    """Base class of every error that bad input to grr_torch raises."""
+
+
+class GrrWarning(UserWarning):
+    """Base class of the warnings: the work goes on, but not with everything that was given."""
+
+
+def _listing(names: Sequence[str], limit: int = 30) -> str:
+    shown = ", ".join(names[:limit])
+    return f"{shown}, … ({len(names)} in all)" if len(names) > limit else shown or "none"
+
+
+class UnknownNameError(GrrError):
+    """A name that is not among the known ones.
+
+    Attributes:
+        kind: What the name stands for ("robot", "link", "joint", …).
+        name: The name that was given.
+        known: The names that would have been valid.
+        nearest: The known name that is most like the given one, or None.
+    """
+
+    def __init__(self, kind: str, name: str, known: Sequence[str], hint: str = "") -> None:
+        self.kind, self.name, self.known = kind, name, tuple(known)
+        matches = difflib.get_close_matches(name, self.known, n=1, cutoff=0.5)
+        self.nearest: str | None = matches[0] if matches else None
+        guess = f" Did you mean '{self.nearest}'?" if self.nearest else ""
+        super().__init__(f"unknown {kind} '{name}'.{guess} Known: {_listing(self.known)}.{hint}")
+
+
+class UrdfError(GrrError):
+    """A URDF that cannot be read or does not describe a robot.
+
+    Attributes:
+        source: The file (or the name of the text) it was read from.
+        reason: What is wrong with it.
+    """
+
+    def __init__(self, source: str | Path, reason: str) -> None:
+        self.source, self.reason = str(source), reason
+        super().__init__(f"{source}: {reason}")
+
+
+class MeshNotFoundError(GrrError):
+    """A mesh that a URDF names and that is in none of the places it could be.
+
+    Attributes:
+        filename: The name in the URDF.
+        link: The link it belongs to.
+        searched: The paths that were tried.
+    """
+
+    def __init__(self, filename: str, link: str, searched: Sequence[Path]) -> None:
+        self.filename, self.link, self.searched = filename, link, tuple(searched)
+        places = ", ".join(str(path) for path in searched) or "nowhere: no package folder was given"
+        super().__init__(
+            f"mesh '{filename}' of link '{link}' not found; looked at: {places}. "
+            "Folders to search for package:// names are given by --package-dir (package_dirs)."
+        )
+
+
+class ParameterError(GrrError, ValueError):
+    """A parameter outside its valid range.
+
+    Attributes:
+        name: The parameter.
+        value: The value that was given.
+        valid: What would have been valid.
+    """
+
+    def __init__(self, name: str, value: object, valid: str) -> None:
+        self.name, self.value, self.valid = name, value, valid
+        super().__init__(f"{name}: got {value}; valid: {valid}")
+
+
+class SeedError(GrrError):
+    """Seeds of which none can start a roadmap.
+
+    Attributes:
+        reasons: One reason for each seed, by its index.
+    """
+
+    def __init__(self, message: str, reasons: dict[int, str] | None = None) -> None:
+        self.reasons = reasons or {}
+        super().__init__(message)
+
+
+class FileFormatError(GrrError):
+    """A file that is not what it should be: truncated, of another version, or not consistent with itself.
+
+    Attributes:
+        path: The file.
+        reason: What is wrong with it.
+    """
+
+    def __init__(self, path: str | Path, reason: str) -> None:
+        self.path, self.reason = Path(path), reason
+        super().__init__(f"{path}: {reason}")
+
+
+class OutputError(GrrError):
+    """An output that cannot be written.
+
+    Attributes:
+        path: The file that was to be written.
+        reason: Why it was not.
+    """
+
+    def __init__(self, path: str | Path, reason: str) -> None:
+        self.path, self.reason = Path(path), reason
+        super().__init__(f"cannot write {path}: {reason}")

@@ -1,0 +1,57 @@
+"""Writing files so that nothing is lost: a temporary file beside the target, renamed when it is complete."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from grr_torch.errors import OutputError
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Finds out before the work starts whether `path` could be written.
+
+    Raises:
+        OutputError: Its folder is missing or not writable, or it is a folder itself.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise OutputError(path, "it is a folder")
+    if not path.parent.is_dir():
+        raise OutputError(path, f"folder '{path.parent}' does not exist")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise OutputError(path, str(error.strerror)) from error
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Gives a temporary path in the same folder; renames it to `path` if the block succeeds, else removes it.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    path = Path(path)
+    check_writable(path)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=f".partial{path.suffix}", dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())  # mkstemp makes it private
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError(path, str(error.strerror or error)) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

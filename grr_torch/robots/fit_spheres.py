@@ -1,0 +1,215 @@
+"""Fitting spheres to the collision geometry of a URDF.
+
+A sphere around an inside point c whose distance to the surface is d sticks out of the solid by at most τ if its
+radius is d + τ: the ball of radius d lies inside. So for a tolerance τ, covering the solid is a set cover over
+such spheres, and for a number of spheres it is a search for the smallest τ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.distance import cdist
+
+from grr_torch.errors import ParameterError, UrdfError
+from grr_torch.robots.geometry import Mask, Points, Solid, link_meshes
+from grr_torch.robots.spheres import Sphere
+from grr_torch.robots.tighten_spheres import tighten, unit_sphere
+from grr_torch.robots.urdf import Urdf
+
+# spheres are written with this many decimals [m]; radii are rounded up
+_DECIMALS = 5
+
+
+@dataclass(frozen=True)
+class LinkFit:
+    """How well the spheres of one link fit.
+
+    Attributes:
+        spheres: The spheres.
+        mean_excess: Mean distance [m] of the spheres' outer surface from the geometry.
+        max_excess: Largest distance [m] of the spheres' outer surface from the geometry.
+        uncovered: How far [m] the point that sticks out most lies outside all spheres; 0 if none does.
+    """
+
+    spheres: tuple[Sphere, ...]
+    mean_excess: float
+    max_excess: float
+    uncovered: float
+
+
+def fit_spheres(
+    urdf: Urdf,
+    *,
+    count: int | None = None,
+    tolerance: float | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda link: None,
+) -> dict[str, LinkFit]:
+    """Fits spheres to each link that has collision geometry, so that every point of it is inside one.
+
+    Args:
+        urdf: The robot.
+        count: At most this many spheres a link, with the least excess found (16 if neither is given).
+        tolerance: As few spheres as found whose surface lies at most this far [m] from the geometry.
+        seed: For the sampled surface points.
+        progress: Called with each link's name before it is fitted.
+
+    Returns:
+        The fit of each link.
+
+    Raises:
+        ParameterError: Both or an invalid one of `count` and `tolerance` is given.
+        UrdfError: No link has collision geometry, or a mesh cannot be read.
+        MeshNotFoundError: A mesh is missing.
+    """
+    if count is not None and tolerance is not None:
+        raise ParameterError("spheres and tolerance", (count, tolerance), "one of the two")
+    if count is not None and not 1 <= count <= 1000:
+        raise ParameterError("spheres", count, "1 to 1000 a link")
+    if tolerance is not None and not 1e-4 <= tolerance < np.inf:
+        raise ParameterError("tolerance", tolerance, "0.0001 m or more")
+    links = [link for link, shapes in urdf.collisions.items() if shapes]
+    if not links:
+        raise UrdfError(urdf.name, "no link has collision geometry to fit spheres to")
+    fits: dict[str, LinkFit] = {}
+    for link in links:
+        progress(link)
+        fits[link] = _fit_link(urdf, link, 16 if count is None and tolerance is None else count, tolerance, seed)
+    return fits
+
+
+def _fit_link(urdf: Urdf, link: str, count: int | None, tolerance: float | None, seed: int) -> LinkFit:
+    meshes = link_meshes(urdf, link)
+    size = float(np.linalg.norm(np.ptp(np.vstack([mesh.bounds for mesh in meshes]), axis=0)))
+    solid = Solid.sampled(meshes, _spacing(size), seed)
+    candidates, depths = _candidates(solid, size)
+    inner = candidates[:: max(1, len(candidates) // 1000)]
+    targets = np.vstack([solid.boundary[_thinned(solid.boundary, 4000)], inner])
+    distances = cdist(candidates, targets)
+    if tolerance is None:
+        assert count is not None
+        chosen, tolerance = _least_tolerance(distances, depths, count, size)
+    else:
+        chosen = _cover(distances, depths + tolerance, len(targets))
+        assert chosen is not None
+    centres, radii = tighten(candidates[chosen], depths[chosen] + tolerance, solid, inner, size, seed)
+    centres = np.round(centres, _DECIMALS)
+    radii = _shrunk(centres, radii, targets)
+    for fresh in range(4):
+        radii = _grown(centres, radii, Solid.sampled(meshes, _spacing(size), seed + 100 * fresh).boundary)
+    # what one more sample finds outside bounds what lies between the samples
+    check = Solid.sampled(meshes, _spacing(size), seed + 1000)
+    radii = radii + _outside(check.boundary, centres, radii)
+    radii = np.ceil(radii * 10**_DECIMALS) / 10**_DECIMALS
+    spheres = tuple(
+        Sphere((float(x), float(y), float(z)), float(r)) for (x, y, z), r in zip(centres, radii, strict=True)
+    )
+    return measure(spheres, Solid.sampled(meshes, _spacing(size), seed + 2000))
+
+
+def _spacing(size: float) -> float:
+    """How densely a link's surface is sampled [m]: a hundredth of the link, at most 2 mm."""
+    return min(size / 100.0, 0.002)
+
+
+def measure(spheres: tuple[Sphere, ...], solid: Solid) -> LinkFit:
+    """Measures how tightly spheres cover a solid."""
+    centres = np.array([sphere.center for sphere in spheres])
+    radii = np.array([sphere.radius for sphere in spheres])
+    surface = np.vstack([centre + radius * unit_sphere(500) for centre, radius in zip(centres, radii, strict=True)])
+    # the outer surface: what no other sphere covers
+    surface = surface[(cdist(surface, centres) - radii).min(1) > -1e-9]
+    surface = surface[~solid.inside(surface)]
+    excess = solid.distance(surface)
+    return LinkFit(
+        spheres,
+        mean_excess=float(excess.mean()) if len(excess) else 0.0,
+        max_excess=float(excess.max()) if len(excess) else 0.0,
+        uncovered=_outside(solid.boundary, centres, radii),
+    )
+
+
+def _outside(points: Points, centres: Points, radii: Points) -> float:
+    """How far [m] the points stick out of the spheres at most."""
+    return float(max((cdist(points, centres) - radii).min(1).max(), 0.0))
+
+
+def _candidates(solid: Solid, size: float) -> tuple[Points, Points]:
+    """Inside points (C, 3) on a grid, and their distances to the surface (C,)."""
+    corners = np.vstack([mesh.bounds for mesh in solid.meshes])
+    low, high = corners.min(0), corners.max(0)
+    step = max(float(np.prod(high - low) / 6000.0) ** (1.0 / 3.0), size / 400.0)
+    axes = [np.linspace(a, b, max(3, round((b - a) / step) + 1)) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = grid[solid.inside(grid)]
+    # thin parts that the grid misses are covered from their own surface
+    centres = np.vstack([grid, solid.boundary[_thinned(solid.boundary, 500)]])
+    return centres, solid.distance(centres)
+
+
+def _least_tolerance(distances: Points, depths: Points, count: int, size: float) -> tuple[list[int], float]:
+    """The smallest tolerance, to a fiftieth, at which `count` spheres cover all targets."""
+    low, high = 0.0, size
+    best = _cover(distances, depths + high, count)
+    while best is None:
+        low, high = high, 2.0 * high
+        best = _cover(distances, depths + high, count)
+    while high - low > 0.02 * high:
+        middle = 0.5 * (low + high)
+        cover = _cover(distances, depths + middle, count)
+        if cover is None:
+            low = middle
+        else:
+            best, high = cover, middle
+    return best, high
+
+
+def _cover(distances: Points, radii: Points, count: int) -> list[int] | None:
+    """Greedy set cover: rows of `distances` (C, T) whose balls reach all columns; None if over `count`."""
+    reached: Mask = distances <= radii[:, None]
+    gains = reached.sum(1)
+    chosen: list[int] = []
+    left = np.ones(distances.shape[1], dtype=bool)
+    while left.any():
+        best = int(gains.argmax())
+        if len(chosen) == count or gains[best] == 0:
+            return None
+        chosen.append(best)
+        new = reached[best] & left
+        gains = gains - reached[:, new].sum(1)
+        left &= ~new
+    return chosen
+
+
+def _shrunk(centres: Points, radii: Points, targets: Points) -> Points:
+    """Radii no larger than the targets need: each target is left to the sphere in which it lies deepest."""
+    distances = cdist(targets, centres)
+    owner = (distances - radii).argmin(1)
+    return np.array([distances[owner == k, k].max(initial=0.0) for k in range(len(centres))])
+
+
+def _grown(centres: Points, radii: Points, points: Points) -> Points:
+    """Radii large enough that no point is left outside: the nearest sphere takes it in."""
+    distances = cdist(points, centres)
+    owner = (distances - radii).argmin(1)
+    for k in range(len(centres)):
+        radii[k] = max(radii[k], distances[owner == k, k].max(initial=0.0))
+    return radii
+
+
+def _thinned(points: Points, count: int) -> npt.NDArray[np.intp]:
+    """Indices of about `count` points that are spread evenly."""
+    if len(points) <= count:
+        return np.arange(len(points))
+    low, high = points.min(0), points.max(0)
+    cell = float(np.linalg.norm(high - low)) / 200.0
+    while True:
+        keys = np.floor((points - low) / cell).astype(np.int64)
+        index = np.unique(keys, axis=0, return_index=True)[1]
+        if len(index) <= count:
+            return index
+        cell *= 1.15

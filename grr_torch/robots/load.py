@@ -1,0 +1,203 @@
+"""Making a `Robot` from a bundled name or any URDF."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+from xml.sax.saxutils import quoteattr
+
+import torch
+
+from grr_torch.errors import ParameterError, UnknownNameError, UrdfError
+from grr_torch.robots.kinematics import compile_tree, degrees_of_freedom, joint_motion
+from grr_torch.robots.presets import Preset, load_preset, robot_names
+from grr_torch.robots.robot import Robot
+from grr_torch.robots.spheres import SphereModel
+from grr_torch.robots.urdf import Joint, Urdf, read_urdf
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import SerialChain
+
+
+def load_robot(
+    name_or_path: str | os.PathLike[str],
+    *,
+    tool: str | None = None,
+    base: str | None = None,
+    package_dirs: Sequence[str | os.PathLike[str]] = (),
+    held_joints: Mapping[str, float] | None = None,
+    spheres: str | os.PathLike[str] | SphereModel | None = None,
+    margin: float | None = None,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> Robot:
+    """Loads a bundled robot or a URDF file.
+
+    Args:
+        name_or_path: A bundled name (`grr-torch robots` lists them) or the path of a URDF.
+        tool: Link whose pose is controlled; by default the preset's, or the URDF's last link if it has one only.
+        base: Link in whose frame poses are given; by default the preset's, or the URDF's root.
+        package_dirs: Folders in which `package://` mesh names are searched.
+        held_joints: Values [rad or m] of joints that do not move. Joints outside the chain stay at 0 by default.
+        spheres: Sphere file or model; by default the preset's. A URDF without one is not checked for self-collision.
+        margin: Distance [m] below which two links count as in collision; by default the preset's, or 0.
+        device: Where tensors live; the CPU by default.
+        dtype: torch.float64, or torch.float32 where less accuracy will do.
+
+    Raises:
+        UnknownNameError: No such robot, link or joint; the known ones are listed.
+        UrdfError: The URDF is malformed or has no movable joint between base and tool.
+        MeshNotFoundError: A mesh that it names is missing.
+        FileFormatError: The sphere file is not one.
+        ParameterError: A held value, the margin or the dtype is not valid.
+    """
+    if dtype not in (torch.float64, torch.float32):
+        raise ParameterError("dtype", dtype, "torch.float64 or torch.float32")
+    preset = _preset(name_or_path)
+    urdf = read_urdf(preset.urdf if preset else name_or_path, package_dirs)
+    urdf.check_meshes()
+    base = base or (preset.base if preset else urdf.root)
+    tool = tool or (preset.tool if preset else _only_leaf(urdf))
+    if spheres is None and preset is not None and preset.spheres is not None:
+        spheres = preset.spheres
+    if spheres is not None and not isinstance(spheres, SphereModel):
+        spheres = SphereModel.load(spheres, urdf.links)
+    if margin is None:
+        margin = preset.margin if preset else 0.0
+    return make_robot(
+        urdf,
+        name=preset.name if preset else urdf.name,
+        base=base,
+        tool=tool,
+        held_joints=held_joints or {},
+        spheres=spheres,
+        margin=margin,
+        device=torch.device(device or "cpu"),
+        dtype=dtype,
+    )
+
+
+def make_robot(
+    urdf: Urdf,
+    *,
+    name: str,
+    base: str,
+    tool: str,
+    held_joints: Mapping[str, float],
+    spheres: SphereModel | None,
+    margin: float,
+    device: torch.device,
+    dtype: torch.dtype,
+) -> Robot:
+    """Makes a `Robot` from a validated URDF; see `load_robot`."""
+    held = _held(urdf, held_joints)
+    urdf.path(base, tool)  # names what is wrong before pytorch-kinematics sees it
+    chain = _chain(urdf, base, tool, held).to(dtype=dtype, device=device)
+    path = [urdf.joints[joint.name] for joint in chain.get_joints(exclude_fixed=False) if joint.name in urdf.joints]
+    moving = degrees_of_freedom(path, held)
+    if not moving:
+        raise UrdfError(urdf.name, f"no movable joint between base '{base}' and tool '{tool}'")
+    tree = compile_tree(urdf, path, base, tool, held, dtype=dtype, device=device)
+    figures = {joint.name: [joint.lower, joint.upper, joint.velocity] for joint in moving}
+    for joint in path:
+        _add_mimic_limits(urdf, joint, figures)
+    lower, upper, velocity = (
+        torch.tensor([row[k] for row in figures.values()], dtype=dtype, device=device) for k in range(3)
+    )
+    if bool((lower > upper).any()):
+        raise UrdfError(urdf.name, "a joint and one that mimics it have limits that exclude each other")
+    return Robot(
+        name=name,
+        urdf=urdf,
+        base=base,
+        tool=tool,
+        chain=chain,
+        joint_names=tuple(figures),
+        lower=lower,
+        upper=upper,
+        continuous=torch.tensor([joint.kind == "continuous" for joint in moving], device=device),
+        velocity_limits=velocity,
+        held_joints=held,
+        tree=tree,
+        spheres=spheres,
+        margin=0.0,
+    ).with_margin(margin)
+
+
+def _preset(name_or_path: str | os.PathLike[str]) -> Preset | None:
+    """The preset of a bundled name; None for what is, or looks like, a path."""
+    text = os.fspath(name_or_path)
+    if text in robot_names():
+        return load_preset(text)
+    if os.sep not in text and not Path(text).suffix and not Path(text).exists():
+        raise UnknownNameError("robot", text, robot_names(), " A URDF is given by its path.")
+    return None
+
+
+def _only_leaf(urdf: Urdf) -> str:
+    leaves = urdf.leaves()
+    if len(leaves) > 1:
+        raise UnknownNameError("tool frame", "(none given)", urdf.links, f" Ends of chains: {', '.join(leaves)}.")
+    return leaves[0]
+
+
+def _held(urdf: Urdf, held_joints: Mapping[str, float]) -> dict[str, float]:
+    movable = [joint.name for joint in urdf.joints.values() if joint.movable]
+    for name, value in held_joints.items():
+        if name not in movable:
+            raise UnknownNameError("joint", name, movable, " (to be held)")
+        joint = urdf.joints[name]
+        if not math.isfinite(value) or not joint.lower <= value <= joint.upper:
+            raise ParameterError(f"held joint '{name}'", value, f"{joint.lower} to {joint.upper}")
+    return dict(held_joints)
+
+
+def _add_mimic_limits(urdf: Urdf, joint: Joint, figures: dict[str, list[float]]) -> None:
+    """Narrows the limits of the joint that drives a mimic joint by the mimic joint's own."""
+    multiplier, offset, source = 1.0, 0.0, joint
+    while source.mimic is not None:
+        name, factor, shift = source.mimic
+        multiplier, offset, source = multiplier * factor, multiplier * shift + offset, urdf.joints[name]
+    if source is joint or source.name not in figures or multiplier == 0.0:
+        return
+    ends = sorted([(joint.lower - offset) / multiplier, (joint.upper - offset) / multiplier])
+    driver = figures[source.name]
+    driver[0], driver[1] = max(driver[0], ends[0]), min(driver[1], ends[1])
+    driver[2] = min(driver[2], joint.velocity / abs(multiplier))
+
+
+def _chain(urdf: Urdf, base: str, tool: str, held: Mapping[str, float]) -> SerialChain:
+    """The chain by pytorch-kinematics, from a URDF reduced to what it reads and complains of nothing in."""
+    import pytorch_kinematics
+
+    lines = [f"<robot name={quoteattr(urdf.name)}>"]
+    lines += [f"<link name={quoteattr(link)}/>" for link in urdf.links]
+    lines += [_reduced(joint, held) for joint in urdf.joints.values()]
+    text = "\n".join([*lines, "</robot>"]).encode()
+    with contextlib.redirect_stderr(io.StringIO()):
+        chain = pytorch_kinematics.build_serial_chain_from_urdf(text, tool, base)
+    return cast("SerialChain", chain)
+
+
+def _reduced(joint: Joint, held: Mapping[str, float]) -> str:
+    from trimesh.transformations import euler_from_matrix
+
+    kind = "fixed" if joint.name in held else joint.kind
+    origin = joint.origin
+    if joint.name in held:
+        origin = origin @ joint_motion(joint, held[joint.name])
+    xyz = " ".join(f"{value:.17g}" for value in origin[:3, 3])
+    rpy = " ".join(f"{value:.17g}" for value in euler_from_matrix(origin, "sxyz"))
+    axis = " ".join(f"{value:.17g}" for value in joint.axis)
+    lower, upper = max(joint.lower, -1e9), min(joint.upper, 1e9)
+    return (
+        f"<joint name={quoteattr(joint.name)} type='{kind}'><parent link={quoteattr(joint.parent)}/>"
+        f"<child link={quoteattr(joint.child)}/><origin xyz='{xyz}' rpy='{rpy}'/><axis xyz='{axis}'/>"
+        f"<limit lower='{lower:.17g}' upper='{upper:.17g}' effort='0' velocity='{min(joint.velocity, 1e9):.17g}'/>"
+        "</joint>"
+    )

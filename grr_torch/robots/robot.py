@@ -1,0 +1,235 @@
+"""The robot: a chain from base to tool, its limits, its kinematics and its self-collision model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from grr_torch.errors import ParameterError
+from grr_torch.robots.kinematics import Frame, KinematicTree
+from grr_torch.robots.self_collision import SphereKernel
+from grr_torch.robots.spheres import SphereModel
+from grr_torch.robots.urdf import Urdf
+
+if TYPE_CHECKING:
+    from pytorch_kinematics import SerialChain
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A serial arm, as `load_robot` makes it. Immutable; all tensors live on one device in one dtype.
+
+    Configurations are (*batch, n) tensors: radians for revolute and continuous joints, metres for prismatic ones.
+    Poses are those of the tool frame in the base frame.
+
+    Attributes:
+        name: The bundled name, or the URDF's.
+        urdf: The URDF it was read from.
+        base: Link in whose frame poses are given.
+        tool: Link whose pose is controlled.
+        chain: The same chain as a `pytorch_kinematics.SerialChain` (float32 offsets, mimic joints as degrees of
+            freedom; the kernels here use the URDF's float64 figures).
+        joint_names: The n joints of a configuration.
+        lower: (n,) lower position limits; −inf where there is none.
+        upper: (n,) upper position limits; inf where there is none.
+        continuous: (n,) joints of URDF type continuous: their differences are wrapped.
+        velocity_limits: (n,) velocity limits [rad/s or m/s]; inf where there is none.
+        held_joints: Values of joints that do not move.
+        tree: Constants of the kinematics of all links.
+        spheres: The self-collision model, or None: then nothing is checked.
+        margin: Distance [m] below which two links count as in collision.
+    """
+
+    name: str
+    urdf: Urdf
+    base: str
+    tool: str
+    chain: SerialChain
+    joint_names: tuple[str, ...]
+    lower: Tensor
+    upper: Tensor
+    continuous: Tensor
+    velocity_limits: Tensor
+    held_joints: Mapping[str, float]
+    tree: KinematicTree
+    spheres: SphereModel | None
+    margin: float
+
+    def __repr__(self) -> str:
+        return f"Robot('{self.name}', n={self.n}, base='{self.base}', tool='{self.tool}')"
+
+    @property
+    def n(self) -> int:
+        """Degrees of freedom."""
+        return len(self.joint_names)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating-point type of all computations."""
+        return self.lower.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of all computations."""
+        return self.lower.device
+
+    def with_margin(self, margin: float) -> Robot:
+        """The same robot with another self-collision margin [m].
+
+        Raises:
+            ParameterError: The margin is negative or not finite.
+        """
+        if not (math.isfinite(margin) and margin >= 0.0):
+            raise ParameterError("margin", margin, "0 or more, in metres")
+        return replace(self, margin=float(margin))
+
+    def forward_kinematics(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Tool poses.
+
+        Args:
+            q: (*batch, n) configurations [rad or m].
+
+        Returns:
+            Positions (*batch, 3) [m] and rotation matrices (*batch, 3, 3), in the base frame.
+
+        Raises:
+            ParameterError: The last axis is not n.
+        """
+        columns = self.columns(q)
+        position, rotation = self.tree.tool_pose(self.tree.frames(columns))
+        return _rows(position, q), _rows(rotation, q)
+
+    def jacobian(self, q: Tensor) -> Tensor:
+        """Geometric Jacobians (*batch, 6, n) of the tool: base frame, linear rows [m] above angular ones [rad].
+
+        Args:
+            q: (*batch, n) configurations [rad or m].
+
+        Raises:
+            ParameterError: The last axis is not n.
+        """
+        return self.pose_and_jacobian(q)[2]
+
+    def pose_and_jacobian(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Tool poses and Jacobians for the price of one.
+
+        Args:
+            q: (*batch, n) configurations [rad or m].
+
+        Returns:
+            Positions (*batch, 3) [m], rotation matrices (*batch, 3, 3) and Jacobians (*batch, 6, n).
+
+        Raises:
+            ParameterError: The last axis is not n.
+        """
+        frames = self.tree.frames(self.columns(q))
+        position, rotation = self.tree.tool_pose(frames)
+        return _rows(position, q), _rows(rotation, q), _rows(self.tree.jacobian(frames, position), q)
+
+    def link_poses(self, q: Tensor) -> dict[str, Tensor]:
+        """Poses T_base_link (*batch, 4, 4) of every link of the robot, also beside and beyond the chain.
+
+        Args:
+            q: (*batch, n) configurations [rad or m].
+
+        Raises:
+            ParameterError: The last axis is not n.
+        """
+        columns = self.columns(q)
+        frames = self.tree.frames(columns)
+        bottom = columns.new_tensor([0.0, 0.0, 0.0, 1.0])[:, None].expand(4, columns.shape[1])
+        poses: dict[str, Tensor] = {}
+        for link, (frame, pose) in self.tree.links.items():
+            placed = frames[frame].place(pose.T.contiguous()).transpose(0, 1)
+            poses[link] = _rows(torch.cat([placed, bottom[None]]), q)
+        return poses
+
+    def self_collision_distance(self, q: Tensor) -> Tensor:
+        """Signed distance (*batch,) [m] of the closest two links of the sphere model; negative in penetration.
+
+        Differentiable. The margin is not subtracted. inf where the robot has no sphere model.
+
+        Args:
+            q: (*batch, n) configurations [rad or m].
+
+        Raises:
+            ParameterError: The last axis is not n.
+        """
+        columns = self.columns(q)
+        if self._sphere_kernel is None:
+            return columns.new_full(q.shape[:-1], math.inf)
+        return self._sphere_kernel.distance(self.tree.frames(columns)).reshape(q.shape[:-1])
+
+    def in_self_collision(self, q: Tensor) -> Tensor:
+        """Whether two links are nearer than the margin: (*batch,) bool. False where there is no sphere model.
+
+        Args:
+            q: (*batch, n) configurations [rad or m].
+
+        Raises:
+            ParameterError: The last axis is not n.
+        """
+        return self.columns_in_self_collision(self.columns(q)).reshape(q.shape[:-1])
+
+    def within_limits(self, q: Tensor, tolerance: float = 1e-9) -> Tensor:
+        """Whether every joint lies within its position limits: (*batch,) bool.
+
+        Args:
+            q: (*batch, n) configurations [rad or m].
+            tolerance: Excess that is forgiven [rad or m].
+        """
+        return ((q >= self.lower - tolerance) & (q <= self.upper + tolerance)).all(-1)
+
+    def sample(self, k: int, generator: torch.Generator | None = None) -> Tensor:
+        """Draws (k, n) configurations, uniform within limits; ±π rad or ±1 m where a joint has none.
+
+        Args:
+            k: How many.
+            generator: Source of randomness; torch's global one by default.
+
+        Raises:
+            ParameterError: k is negative.
+        """
+        if k < 0:
+            raise ParameterError("k", k, "0 or more")
+        revolute = torch.tensor([self.urdf.joints[name].kind != "prismatic" for name in self.joint_names])
+        reach = torch.where(revolute, math.pi, 1.0).to(self.lower)
+        lower = torch.where(self.lower.isfinite(), self.lower, torch.minimum(-reach, self.upper - 2.0 * reach))
+        upper = torch.where(self.upper.isfinite(), self.upper, torch.maximum(reach, self.lower + 2.0 * reach))
+        # drawn on the CPU, so that a seed gives the same configurations on every device
+        unit = torch.rand(k, self.n, dtype=self.dtype, generator=generator).to(self.device)
+        return lower + (upper - lower) * unit
+
+    def columns(self, q: Tensor) -> Tensor:
+        """Configurations (*batch, n) as contiguous columns (n, N) in the robot's dtype, on its device.
+
+        Raises:
+            ParameterError: The last axis is not n.
+        """
+        if q.ndim == 0 or q.shape[-1] != self.n:
+            raise ParameterError("configuration shape", tuple(q.shape), f"(*batch, {self.n})")
+        return q.to(device=self.device, dtype=self.dtype).reshape(-1, self.n).T.contiguous()
+
+    def columns_in_self_collision(self, columns: Tensor) -> Tensor:
+        """`in_self_collision` for columns (n, N): (N,) bool."""
+        if self._sphere_kernel is None:
+            return torch.zeros(columns.shape[1], dtype=torch.bool, device=columns.device)
+        return self._sphere_kernel.collides(self.tree, columns, self.margin)
+
+    @cached_property
+    def _sphere_kernel(self) -> SphereKernel | None:
+        return None if self.spheres is None else SphereKernel.compile(self.spheres, self.tree, self.lower)
+
+
+def _rows(columns: Tensor, q: Tensor) -> Tensor:
+    """(…, N) results as (*batch, …), where q is (*batch, n)."""
+    return columns.movedim(-1, 0).reshape(*q.shape[:-1], *columns.shape[:-1])
+
+
+__all__ = ["Frame", "Robot"]
