@@ -1,0 +1,80 @@
+"""Global redundancy resolution: one smooth, repeatable, checked configuration for every pose of a redundant arm.
+
+The names below are imported when they are first used, so that `import grr_torch` is quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from grr_torch.errors import GrrError, GrrWarning
+    from grr_torch.projection.continuity import is_continuous
+    from grr_torch.projection.project import Tolerances, project
+    from grr_torch.resolution.build import build
+    from grr_torch.resolution.expand import expand
+    from grr_torch.resolution.roadmap import Roadmap
+    from grr_torch.robots.load import load_robot
+    from grr_torch.robots.presets import load_preset, robot_names
+    from grr_torch.robots.robot import Robot
+    from grr_torch.robots.spheres import SphereModel
+    from grr_torch.spaces.graph import TaskGraph, random_graph, staggered_grid
+    from grr_torch.spaces.task import FixedRotation, Position, TaskSpace
+    from grr_torch.version import __version__
+
+_HOMES = {
+    "GrrError": "errors",
+    "GrrWarning": "errors",
+    "is_continuous": "projection.continuity",
+    "Tolerances": "projection.project",
+    "project": "projection.project",
+    "build": "resolution.build",
+    "expand": "resolution.expand",
+    "Roadmap": "resolution.roadmap",
+    "load_robot": "robots.load",
+    "load_preset": "robots.presets",
+    "robot_names": "robots.presets",
+    "Robot": "robots.robot",
+    "SphereModel": "robots.spheres",
+    "TaskGraph": "spaces.graph",
+    "random_graph": "spaces.graph",
+    "staggered_grid": "spaces.graph",
+    "FixedRotation": "spaces.task",
+    "Position": "spaces.task",
+    "TaskSpace": "spaces.task",
+    "__version__": "version",
+}
+
+__all__ = [
+    "FixedRotation",
+    "GrrError",
+    "GrrWarning",
+    "Position",
+    "Roadmap",
+    "Robot",
+    "SphereModel",
+    "TaskGraph",
+    "TaskSpace",
+    "Tolerances",
+    "__version__",
+    "build",
+    "expand",
+    "is_continuous",
+    "load_preset",
+    "load_robot",
+    "project",
+    "random_graph",
+    "robot_names",
+    "staggered_grid",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'grr_torch' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"grr_torch.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

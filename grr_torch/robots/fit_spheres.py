@@ -7,7 +7,6 @@ such spheres, and for a number of spheres it is a search for the smallest τ.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,13 +14,18 @@ import numpy.typing as npt
 from scipy.spatial.distance import cdist
 
 from grr_torch.errors import ParameterError, UrdfError
+from grr_torch.progress import Progress, silent
 from grr_torch.robots.geometry import Mask, Points, Solid, link_meshes
 from grr_torch.robots.spheres import Sphere
 from grr_torch.robots.tighten_spheres import tighten, unit_sphere
 from grr_torch.robots.urdf import Urdf
 
+# spheres a link, unless told otherwise
+_COUNT = 16
 # spheres are written with this many decimals [m]; radii are rounded up
 _DECIMALS = 5
+# descents from different starts, of which the best is kept
+_STARTS = 3
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class LinkFit:
 
     Attributes:
         spheres: The spheres.
-        mean_excess: Mean distance [m] of the spheres' outer surface from the geometry.
+        mean_excess: Area-weighted mean distance [m] of the spheres' outer surface from the geometry.
         max_excess: Largest distance [m] of the spheres' outer surface from the geometry.
         uncovered: How far [m] the point that sticks out most lies outside all spheres; 0 if none does.
     """
@@ -47,7 +51,7 @@ def fit_spheres(
     count: int | None = None,
     tolerance: float | None = None,
     seed: int = 0,
-    progress: Callable[[str], None] = lambda link: None,
+    progress: Progress = silent,
 ) -> dict[str, LinkFit]:
     """Fits spheres to each link that has collision geometry, so that every point of it is inside one.
 
@@ -56,7 +60,7 @@ def fit_spheres(
         count: At most this many spheres a link, with the least excess found (16 if neither is given).
         tolerance: As few spheres as found whose surface lies at most this far [m] from the geometry.
         seed: For the sampled surface points.
-        progress: Called with each link's name before it is fitted.
+        progress: Told how many links are fitted.
 
     Returns:
         The fit of each link.
@@ -76,9 +80,10 @@ def fit_spheres(
     if not links:
         raise UrdfError(urdf.name, "no link has collision geometry to fit spheres to")
     fits: dict[str, LinkFit] = {}
-    for link in links:
-        progress(link)
-        fits[link] = _fit_link(urdf, link, 16 if count is None and tolerance is None else count, tolerance, seed)
+    for done, link in enumerate(links):
+        progress("fitting spheres", done, len(links))
+        fits[link] = _fit_link(urdf, link, _COUNT if tolerance is None and count is None else count, tolerance, seed)
+    progress("fitting spheres", len(links), len(links))
     return fits
 
 
@@ -96,19 +101,32 @@ def _fit_link(urdf: Urdf, link: str, count: int | None, tolerance: float | None,
     else:
         chosen = _cover(distances, depths + tolerance, len(targets))
         assert chosen is not None
-    centres, radii = tighten(candidates[chosen], depths[chosen] + tolerance, solid, inner, size, seed)
+    samples = [solid, *(Solid.sampled(meshes, _spacing(size), seed + 100 * k) for k in range(1, 6))]
+    # descent ends in a local minimum: the best of several starts is kept
+    rng = np.random.default_rng(seed)
+    fits: list[LinkFit] = []
+    for start in range(_STARTS):
+        moved = candidates[chosen] + rng.normal(scale=0.008 * size * start, size=(len(chosen), 3))
+        centres, radii = tighten(moved, depths[chosen] + tolerance, solid, inner, size, seed + start)
+        fits.append(_closed(centres, radii, targets, samples))
+    return min(fits, key=lambda fit: fit.mean_excess + 0.25 * fit.max_excess)
+
+
+def _closed(centres: Points, radii: Points, targets: Points, samples: list[Solid]) -> LinkFit:
+    """Spheres resized until no sampled point of the geometry is outside, rounded and measured."""
     centres = np.round(centres, _DECIMALS)
     radii = _shrunk(centres, radii, targets)
-    for fresh in range(4):
-        radii = _grown(centres, radii, Solid.sampled(meshes, _spacing(size), seed + 100 * fresh).boundary)
+    for sample in samples[:-2]:
+        radii = _grown(centres, radii, sample.boundary)
     # what one more sample finds outside bounds what lies between the samples
-    check = Solid.sampled(meshes, _spacing(size), seed + 1000)
-    radii = radii + _outside(check.boundary, centres, radii)
+    radii = radii + _outside(samples[-2].boundary, centres, radii)
     radii = np.ceil(radii * 10**_DECIMALS) / 10**_DECIMALS
     spheres = tuple(
-        Sphere((float(x), float(y), float(z)), float(r)) for (x, y, z), r in zip(centres, radii, strict=True)
+        Sphere((float(x), float(y), float(z)), float(r))
+        for (x, y, z), r in zip(centres, radii, strict=True)
+        if r > 0.0
     )
-    return measure(spheres, Solid.sampled(meshes, _spacing(size), seed + 2000))
+    return measure(spheres, samples[-1])
 
 
 def _spacing(size: float) -> float:
@@ -121,14 +139,14 @@ def measure(spheres: tuple[Sphere, ...], solid: Solid) -> LinkFit:
     centres = np.array([sphere.center for sphere in spheres])
     radii = np.array([sphere.radius for sphere in spheres])
     surface = np.vstack([centre + radius * unit_sphere(500) for centre, radius in zip(centres, radii, strict=True)])
-    # the outer surface: what no other sphere covers
-    surface = surface[(cdist(surface, centres) - radii).min(1) > -1e-9]
-    surface = surface[~solid.inside(surface)]
-    excess = solid.distance(surface)
+    area = np.repeat(radii**2, 500)
+    # the outer surface: what neither another sphere nor the geometry covers
+    outer = ((cdist(surface, centres) - radii).min(1) > -1e-9) & ~solid.inside(surface)
+    excess = solid.distance(surface[outer])
     return LinkFit(
         spheres,
-        mean_excess=float(excess.mean()) if len(excess) else 0.0,
-        max_excess=float(excess.max()) if len(excess) else 0.0,
+        mean_excess=float(np.average(excess, weights=area[outer])) if outer.any() else 0.0,
+        max_excess=float(excess.max()) if outer.any() else 0.0,
         uncovered=_outside(solid.boundary, centres, radii),
     )
 

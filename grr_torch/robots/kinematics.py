@@ -38,7 +38,7 @@ class Frame(NamedTuple):
         placed = torch.addmm(
             points[:, 2:] @ self.zp.reshape(2, 3 * width), points[:, :2], self.xy.reshape(2, 3 * width)
         )
-        return placed.view(-1, 3, width)
+        return placed.view(len(points), 3, width)
 
 
 @dataclass(frozen=True)

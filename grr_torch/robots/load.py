@@ -7,6 +7,7 @@ import io
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 from xml.sax.saxutils import quoteattr
@@ -69,7 +70,7 @@ def load_robot(
         spheres = SphereModel.load(spheres, urdf.links)
     if margin is None:
         margin = preset.margin if preset else 0.0
-    return make_robot(
+    robot = make_robot(
         urdf,
         name=preset.name if preset else urdf.name,
         base=base,
@@ -80,6 +81,7 @@ def load_robot(
         device=torch.device(device or "cpu"),
         dtype=dtype,
     )
+    return replace(robot, preset=preset)
 
 
 def make_robot(

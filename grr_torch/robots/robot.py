@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
-from grr_torch.robots.kinematics import Frame, KinematicTree
+from grr_torch.robots.kinematics import KinematicTree
+from grr_torch.robots.presets import Preset
 from grr_torch.robots.self_collision import SphereKernel
 from grr_torch.robots.spheres import SphereModel
 from grr_torch.robots.urdf import Urdf
@@ -44,6 +45,7 @@ class Robot:
         tree: Constants of the kinematics of all links.
         spheres: The self-collision model, or None: then nothing is checked.
         margin: Distance [m] below which two links count as in collision.
+        preset: What the bundled robot is used with unless told otherwise; None for others.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Robot:
     tree: KinematicTree
     spheres: SphereModel | None
     margin: float
+    preset: Preset | None = None
 
     def __repr__(self) -> str:
         return f"Robot('{self.name}', n={self.n}, base='{self.base}', tool='{self.tool}')"
@@ -231,5 +234,3 @@ def _rows(columns: Tensor, q: Tensor) -> Tensor:
     """(…, N) results as (*batch, …), where q is (*batch, n)."""
     return columns.movedim(-1, 0).reshape(*q.shape[:-1], *columns.shape[:-1])
 
-
-__all__ = ["Frame", "Robot"]

@@ -51,8 +51,9 @@ class SphereModel:
         for link, of_link in self.spheres.items():
             lines.append(f"  {_quoted(link)}:" + ("" if of_link else " []"))
             for sphere in of_link:
-                center = ", ".join(f"{value:.5f}" for value in sphere.center)
-                lines.append(f"  - {{center: [{center}], radius: {sphere.radius:.5f}}}")
+                # every digit is kept: a roadmap file carries the model as this text
+                center = ", ".join(_number(value) for value in sphere.center)
+                lines.append(f"  - {{center: [{center}], radius: {_number(sphere.radius)}}}")
         lines.append("self_collision_ignore:" + ("" if self.ignored else " {}"))
         for first in sorted({pair[0] for pair in self.ignored}):
             others = sorted(pair[1] for pair in self.ignored if pair[0] == first)
@@ -109,6 +110,12 @@ class SphereModel:
 def ordered_pair(first: str, second: str) -> tuple[str, str]:
     """The two names in alphabetical order."""
     return (first, second) if first < second else (second, first)
+
+
+def _number(value: float) -> str:
+    text = repr(value)
+    # YAML 1.1 takes 1e-05 for text and 1.0e-05 for a number
+    return text if "e" not in text or "." in text else text.replace("e", ".0e")
 
 
 def _quoted(name: str) -> str:

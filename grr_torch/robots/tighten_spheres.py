@@ -9,7 +9,7 @@ from torch.nn.functional import grid_sample
 
 from grr_torch.robots.geometry import Points, Solid
 
-_STEPS = 1000
+_STEPS = 2500
 # nodes of the distance field along each axis
 _NODES = 72
 # surface points that each step looks at, drawn anew, so that no gap hides between them
@@ -17,7 +17,7 @@ _DRAWN = 3000
 # all lengths below are shares of the link's size
 _RATE = 0.01
 _SOFT_COVER, _SOFT_OUTER = 0.003, 0.006
-_OVERLAP = 0.002
+_OVERLAP = 0.001
 _STEEP = 0.06
 
 
@@ -26,7 +26,7 @@ def tighten(
 ) -> tuple[Points, Points]:
     """Minimises the mean distance of the spheres' outer surface from a solid, under a penalty for what they miss.
 
-    Excess is weighted by area, plus its fourth power, which holds down the largest one.
+    Excess is weighted by area, plus its sixth power, which holds down the largest one.
 
     Args:
         centres: (S, 3) where the spheres start [m].
@@ -59,8 +59,8 @@ def tighten(
         others = (torch.cdist(surface, c) - r).scatter(1, own[:, None], size)
         area = torch.sigmoid(others.amin(1) / (_SOFT_OUTER * size)) * r.detach()[own].square()
         excess = field(surface) / size
-        steep = (excess / _STEEP) ** 4
-        loss = 3e6 * missed + 10.0 * (area * (excess + 0.03 * steep)).sum() / area.sum()
+        steep = (excess / _STEEP) ** 6
+        loss = 3e6 * missed + 10.0 * (area * (excess + 0.1 * steep)).sum() / area.sum()
         torch.autograd.backward(loss)
         optimiser.step()
         schedule.step()

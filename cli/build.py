@@ -1,0 +1,154 @@
+"""`grr-torch build`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from grr_torch.cli.show import print_json, print_rows, progress_bar, quality_rows, reports_errors
+from grr_torch.errors import ParameterError
+
+
+@reports_errors
+def build(
+    robot: Annotated[str, typer.Option(help="A bundled robot (grr-torch robots) or the path of a URDF.")],
+    task: Annotated[str | None, typer.Option(help="position or fixed-rotation; the preset's default.")] = None,
+    points: Annotated[int | None, typer.Option(help="Vertices that the staggered grid is asked for.")] = None,
+    seeds: Annotated[str, typer.Option(help="preset, or a .csv, .txt or .npy FILE, one seed a row.")] = "preset",
+    out: Annotated[Path | None, typer.Option(help="Roadmap file; by default ROBOT.grr.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Recording; by default beside the roadmap, .rrd.")] = None,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
+    reachability: Annotated[
+        int, typer.Option(help="Random starts per unresolved vertex, to tell which are reachable; 0: not measured.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(help="Of all random draws.")] = 0,
+    neighbours: Annotated[int | None, typer.Option(help="Nearest vertices averaged over; 24 or 64.")] = None,
+    tool: Annotated[str | None, typer.Option(help="Link whose pose is controlled.")] = None,
+    base: Annotated[str | None, typer.Option(help="Link in whose frame points are given.")] = None,
+    bounds: Annotated[
+        str | None, typer.Option(help="Bounds of the grid [m].", metavar="X0 X1 Y0 Y1 [Z0 Z1]")
+    ] = None,
+    rotation: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Fixed-axis roll, pitch, yaw of the tool [rad], for fixed-rotation.", metavar="R P Y"),
+    ] = None,
+    package_dir: Annotated[list[Path] | None, typer.Option(help="Folder for package:// meshes; repeatable.")] = None,
+    hold: Annotated[list[str] | None, typer.Option(help="Hold a joint still; repeatable.", metavar="J=VALUE")] = None,
+    spheres: Annotated[Path | None, typer.Option(help="Sphere file for self-collision (grr-torch spheres).")] = None,
+    margin: Annotated[float | None, typer.Option(help="Added to every self-collision check [m].")] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+) -> None:
+    """Build a roadmap, print its quality, and write it with a recording of it.
+
+    Example: grr-torch build --robot kinova
+
+    Example: grr-torch build --robot arm.urdf --tool flange --task position --points 2000
+    --bounds -0.8 0.8 -0.8 0.8 0 1.2 --seeds seeds.csv
+    """
+    from grr_torch.output import check_writable
+    from grr_torch.resolution.build import build as build_roadmap
+    from grr_torch.resolution.seeds import read_seeds
+    from grr_torch.robots.load import load_robot
+
+    with progress_bar() as progress:
+        progress("loading the robot", 0, 1)
+        arm = load_robot(
+            robot,
+            tool=tool,
+            base=base,
+            package_dirs=package_dir or (),
+            held_joints=_held(hold or []),
+            spheres=spheres,
+            margin=margin,
+            device=_device(device),
+        )
+        progress("loading the robot", 1, 1)
+        out = out or Path(f"{arm.name}.grr")
+        recording = None if no_record else record or out.with_suffix(".rrd")
+        for path in (out, recording):
+            if path is not None:
+                check_writable(path)
+        box = None if bounds is None else _bounds(bounds)
+        roadmap = build_roadmap(
+            arm,
+            _task(arm, task, box, rotation),
+            points=points,
+            bounds=box,
+            seeds=None if seeds == "preset" else read_seeds(seeds),
+            neighbours=neighbours,
+            reachability=reachability,
+            seed=seed,
+            progress=progress,
+        )
+        progress("writing", 0, 2)
+        roadmap.save(out)
+        progress("writing", 1, 2)
+        if recording is not None:
+            from grr_torch.recording.roadmap import record_roadmap
+
+            record_roadmap(roadmap, recording)
+        progress("writing", 2, 2)
+    quality = roadmap.quality().to_dict()
+    if as_json:
+        files = {"out": str(out), "record": None if recording is None else str(recording)}
+        print_json({**quality, "build_seconds": roadmap.build_seconds, **files})
+        return
+    title = f"{arm.name}, {roadmap.task.kind} in {roadmap.task.name}"
+    written = str(out) if recording is None else f"{out}, {recording} (grr-torch view {out})"
+    rows = [("built in", f"{roadmap.build_seconds:.2f} s (the algorithm alone)"), ("written", written)]
+    print_rows(title, [*quality_rows(quality), *rows])
+
+
+def _task(
+    arm: Any, kind: str | None, box: list[tuple[float, float]] | None, rotation: tuple[float, float, float] | None
+) -> Any:
+    """The task space where the options say more than the preset does; else its kind."""
+    from grr_torch.spaces.task import FixedRotation, make_task
+
+    preset = arm.preset
+    kind = kind or (preset.default_task if preset else "position" if rotation is None else FixedRotation.kind)
+    if rotation is None and preset is not None and kind in preset.problems and box is None:
+        return kind
+    problem = preset.problems.get(kind) if preset else None
+    sides = box or (problem.bounds if problem else None)
+    if sides is None:
+        return kind
+    if rotation is None and problem is not None and len(problem.bounds) == len(sides):
+        rotation = problem.rotation
+    return make_task(kind, len(sides), rotation)
+
+
+def _bounds(text: str) -> list[tuple[float, float]]:
+    try:
+        numbers = [float(value) for value in text.replace(",", " ").split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (4, 6):
+        raise ParameterError("--bounds", repr(text), "four or six numbers: x0 x1 y0 y1 [z0 z1]")
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
+
+
+def _held(items: list[str]) -> dict[str, float]:
+    held: dict[str, float] = {}
+    for item in items:
+        name, _, value = item.partition("=")
+        try:
+            held[name] = float(value)
+        except ValueError as error:
+            raise ParameterError("--hold", repr(item), "JOINT=VALUE, the value in radians or metres") from error
+    return held
+
+
+def _device(name: str) -> Any:
+    import torch
+
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        available = "cpu, cuda" if torch.cuda.is_available() else "cpu (no CUDA device is available)"
+        raise ParameterError("--device", name, available) from error
+    return device

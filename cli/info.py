@@ -1,0 +1,77 @@
+"""`grr-torch info`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from grr_torch.cli.show import print_json, print_rows, progress_bar, quality_rows, reports_errors
+
+
+@reports_errors
+def info(
+    file: Annotated[Path, typer.Argument(help="A roadmap file.", metavar="FILE.grr")],
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Recompute everything and hold it against what is stored.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Show what a roadmap file holds; exit code 2 if it is not consistent with itself.
+
+    Example: grr-torch info kinova.grr --verify
+    """
+    from grr_torch.resolution.roadmap_file import load_roadmap, read_file
+    from grr_torch.resolution.verify import verify_file
+
+    metadata = read_file(file)[0]
+    roadmap = load_roadmap(file)
+    quality: dict[str, Any] = metadata["quality"]
+    checks = []
+    if verify:
+        with progress_bar() as progress:
+            checks = verify_file(file, progress=progress)
+    passed = all(check.passed for check in checks)
+    robot = roadmap.robot
+    if as_json:
+        parameters = {name: value for name, value in roadmap.parameters.items() if name != "seeds"}
+        data = {
+            **quality,
+            "build_seconds": roadmap.build_seconds,
+            "robot": robot.name,
+            "tool": robot.tool,
+            "base": robot.base,
+            "task": metadata["task"],
+            "parameters": {**parameters, "seeds": len(roadmap.parameters["seeds"])},
+            "format_version": metadata["format_version"],
+            "package_version": metadata["package_version"],
+        }
+        if verify:
+            data["verified"] = passed
+            data["checks"] = {check.name: {"passed": check.passed, "detail": check.detail} for check in checks}
+        print_json(data)
+    else:
+        rotation = metadata["task"].get("rotation")
+        spheres = robot.spheres
+        rows = [
+            ("robot", f"{robot.name}, {robot.n} joints, {robot.base} → {robot.tool}"),
+            ("task", roadmap.task.name + ("" if rotation is None else f", roll pitch yaw {rotation} rad")),
+            (
+                "self-collision model",
+                f"{sum(map(len, spheres.spheres.values()))} spheres, {len(spheres.checked)} pairs of links, "
+                f"margin {1e3 * robot.margin:g} mm"
+                if spheres
+                else "none",
+            ),
+            *quality_rows(quality),
+            ("built in", f"{roadmap.build_seconds:.2f} s by grr-torch {metadata['package_version']}"),
+        ]
+        print_rows(f"{file}: {robot.name}, {roadmap.task.kind}", rows)
+        if checks:
+            results = [(f"{'✓' if check.passed else '✗'} {check.name}", check.detail) for check in checks]
+            print_rows("verified" if passed else "NOT verified", results)
+    if not passed:
+        failed = ", ".join(check.name for check in checks if not check.passed)
+        typer.secho(f"error: {file} is not consistent with itself: {failed}", err=True, fg=typer.colors.RED)
+        raise typer.Exit(2)

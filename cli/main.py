@@ -1,0 +1,81 @@
+"""The command `grr-torch`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from grr_torch.cli.build import build
+from grr_torch.cli.info import info
+from grr_torch.cli.robots import robots
+from grr_torch.cli.spheres import spheres
+from grr_torch.cli.view import view
+from grr_torch.version import __version__
+
+app = typer.Typer(
+    name="grr-torch",
+    help="Global redundancy resolution roadmaps: one smooth, repeatable, checked configuration for every pose.\n\n"
+    "Start with: grr-torch build --robot kinova",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+for command in (robots, build, info, view, spheres):
+    app.command()(command)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"grr-torch {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(  # pyright: ignore[reportUnusedFunction]
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+def run(arguments: Sequence[str] | None = None) -> None:
+    """Runs the command line.
+
+    Args:
+        arguments: What follows the program's name; by default what the process was given.
+    """
+    app(join_bounds(list(sys.argv[1:] if arguments is None else arguments)), prog_name="grr-torch")
+
+
+def join_bounds(arguments: list[str]) -> list[str]:
+    """Puts the four or six numbers after --bounds into one argument: an option takes a fixed number otherwise."""
+    joined: list[str] = []
+    position = 0
+    while position < len(arguments):
+        joined.append(arguments[position])
+        position += 1
+        if joined[-1] == "--bounds":
+            numbers: list[str] = []
+            while position < len(arguments) and _is_number(arguments[position]):
+                numbers.append(arguments[position])
+                position += 1
+            if numbers:
+                joined[-1] = f"--bounds={' '.join(numbers)}"
+    return joined
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+if __name__ == "__main__":
+    run()

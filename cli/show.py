@@ -1,0 +1,117 @@
+"""What the commands share: messages, progress, tables, and errors as one line with exit code 2."""
+
+from __future__ import annotations
+
+import functools
+import json
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, ParamSpec, TypeVar
+
+import typer
+
+from grr_torch.errors import GrrError, GrrWarning
+from grr_torch.progress import Progress
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
+    """Turns bad input into one line on standard error and exit code 2, Ctrl-C into exit code 130."""
+
+    @functools.wraps(command)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("always", GrrWarning)
+                warnings.showwarning = _show_warning
+                return command(*args, **kwargs)
+        except GrrError as error:
+            typer.secho(f"error: {error}", err=True, fg=typer.colors.RED)
+            raise typer.Exit(2) from error
+        except KeyboardInterrupt as error:
+            typer.echo("interrupted: nothing was written", err=True)
+            raise typer.Exit(130) from error
+
+    return wrapped
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any) -> None:
+    if issubclass(category, GrrWarning):
+        typer.secho(f"warning: {message}", err=True, fg=typer.colors.YELLOW)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """A progress bar on standard error, gone when the work is done; silent where there is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        tasks: dict[str, Any] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+def print_json(data: dict[str, Any]) -> None:
+    """One object on standard output."""
+    typer.echo(json.dumps(data, indent=2))
+
+
+def print_rows(title: str, rows: list[tuple[str, str]]) -> None:
+    """A table of names and values on standard output."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column()
+    for name, value in rows:
+        table.add_row(name, value)
+    Console().print(table)
+
+
+def quality_rows(quality: dict[str, Any]) -> list[tuple[str, str]]:
+    """The figures of `Roadmap.quality()` for people."""
+
+    def share(name: str) -> str:
+        return "not measured" if quality[name] is None else f"{100.0 * quality[name]:.2f} %"
+
+    def number(name: str, unit: str, digits: str = ".3f") -> str:
+        return "none" if quality[name] is None else f"{quality[name]:{digits}} {unit}"
+
+    reachable = quality["reachable_vertices"]
+    of_reachable = "reachability not measured: --reachability 40" if reachable is None else f"of {reachable:,}"
+    edges = quality["reachable_edges"]
+    of_edges = "" if edges is None else f" of {edges:,} between reachable vertices"
+    return [
+        ("vertices", f"{quality['vertices']:,}, edges {quality['edges']:,}"),
+        ("resolved", f"{quality['resolved_vertices']:,} ({of_reachable})"),
+        ("coverage", share("coverage")),
+        ("connected edges", f"{quality['connected_edges']:,}{of_edges}"),
+        ("connectivity", share("connectivity")),
+        ("connectivity, resolved edges only", share("connectivity_resolved")),
+        ("smoothness", number("smoothness", "rad/m")),
+        (
+            "  median, 99 %, largest",
+            ", ".join(number(f"smoothness_{which}", "").strip() for which in ("median", "p99", "max")),
+        ),
+        ("largest position error", number("max_position_error", "m", ".1e")),
+        ("largest rotation error", number("max_rotation_error", "rad", ".1e")),
+        (
+            "smallest self-collision distance",
+            number("min_self_collision_distance", "m", ".4f").replace("none", "not checked: no sphere model"),
+        ),
+        ("self-collisions", str(quality["self_collisions"])),
+        ("joint limit violations", str(quality["joint_limit_violations"])),
+    ]

@@ -1,0 +1,226 @@
+"""Recording a roadmap with rerun: the map, how it grew, and the arm moving over it."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from grr_torch.errors import GrrError
+from grr_torch.output import atomic_write
+from grr_torch.recording import colours
+from grr_torch.recording.robot import RecordedRobot
+from grr_torch.recording.tour import tour
+from grr_torch.resolution.roadmap import Roadmap
+
+WAVE, TOUR = "wave", "tour"
+_TOUR_RATE = 25.0
+
+
+def record_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
+    """Writes a roadmap's recording (.rrd), by an atomic rename.
+
+    On the timeline `wave` the expansion grows; on `tour` the arm moves along connected edges. Entities:
+    `roadmap/by_joint/…` and `roadmap/clearance` colour the resolved vertices, `roadmap/connected`, `roadmap/broken`
+    and `roadmap/grid` are edges, `roadmap/unresolved` are vertices that are reachable but have no configuration.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    import rerun as rr
+
+    with atomic_write(path) as temporary:
+        recording = rr.RecordingStream("grr_torch")
+        recording.save(str(temporary), default_blueprint=_blueprint(roadmap))
+        with recording:
+            _log(recording, roadmap)
+        recording.disconnect()
+
+
+def show_roadmap(roadmap: Roadmap) -> None:
+    """Opens a roadmap in the rerun viewer.
+
+    Raises:
+        GrrError: The viewer cannot be started.
+    """
+    import rerun as rr
+
+    recording = rr.RecordingStream("grr_torch")
+    try:
+        recording.spawn(default_blueprint=_blueprint(roadmap))
+    except RuntimeError as error:
+        raise GrrError(f"the rerun viewer cannot be started: {error}; write a file with --save F.rrd") from error
+    with recording:
+        _log(recording, roadmap)
+
+
+def _log(recording: Any, roadmap: Roadmap) -> None:
+    robot = RecordedRobot(recording, roadmap.robot)
+    _log_map(recording, roadmap)
+    if bool(roadmap.resolved.any()):
+        _log_waves(recording, roadmap, robot)
+        _log_tour(recording, roadmap, robot)
+
+
+def _log_map(recording: Any, roadmap: Roadmap) -> None:
+    import rerun as rr
+
+    points = _in_space(roadmap.points.numpy())
+    resolved = roadmap.resolved.numpy()
+    radius = 0.11 * _spacing(roadmap)
+    q = roadmap.configurations[roadmap.resolved]
+    frame = rr.CoordinateFrame(roadmap.robot.base)
+
+    def log(entity: str, *archetypes: Any) -> None:
+        recording.log(f"roadmap/{entity}", frame, *archetypes, static=True)
+
+    for index, name in enumerate(roadmap.robot.joint_names):
+        values = q[:, index].numpy()
+        shade = colours.circle(values) if roadmap.robot.continuous[index] else colours.scale(values)
+        log(f"by_joint/{name}", rr.Points3D(points[resolved], colors=shade, radii=radius))
+    clearance = roadmap.robot.self_collision_distance(q).cpu()
+    if bool(clearance.isfinite().all()) and len(clearance):
+        log("clearance", rr.Points3D(points[resolved], colors=colours.scale(clearance.numpy()), radii=radius))
+    edges = roadmap.edges.numpy()
+    connected = roadmap.connected.numpy()
+    broken = ~connected & resolved[edges].all(1)
+    thin = 0.011 * _spacing(roadmap)
+    log("connected", rr.LineStrips3D(points[edges[connected]], colors=colours.CONNECTED, radii=thin))
+    log("broken", rr.LineStrips3D(points[edges[broken]], colors=colours.BROKEN, radii=4.0 * thin))
+    log("grid", rr.LineStrips3D(points[edges], colors=colours.GRID, radii=0.5 * thin))
+    if roadmap.reachable is not None:
+        left = (roadmap.reachable & ~roadmap.resolved).numpy()
+        log("unresolved", rr.Points3D(points[left], colors=colours.UNRESOLVED, radii=1.6 * radius))
+
+
+def _log_waves(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
+    """The expansion: what is resolved after each wave, and an arm at its latest vertex."""
+    import rerun as rr
+
+    points, wave = _in_space(roadmap.points.numpy()), roadmap.wave.numpy()
+    edges = roadmap.edges[roadmap.connected].numpy()
+    edge_wave = wave[edges].max(1) if len(edges) else np.empty(0, dtype=np.int32)
+    frame = rr.CoordinateFrame(roadmap.robot.base)
+    radius = 0.11 * _spacing(roadmap)
+    latest: list[int] = []
+    recording.log("expansion", frame, static=True)
+    for step in range(int(wave.max()) + 1):
+        recording.set_time(WAVE, sequence=step)
+        done = (wave >= 0) & (wave <= step)
+        shade = np.where((wave[done] == step)[:, None], (255, 176, 0), (90, 150, 200)).astype(np.uint8)
+        recording.log("expansion/vertices", frame, rr.Points3D(points[done], colors=shade, radii=radius))
+        lines = points[edges[edge_wave <= step]]
+        recording.log(
+            "expansion/edges",
+            frame,
+            rr.LineStrips3D(lines, colors=colours.CONNECTED, radii=0.011 * _spacing(roadmap)),
+        )
+        latest.append(int(np.flatnonzero(wave == step)[0]) if (wave == step).any() else latest[-1])
+    recording.reset_time()
+    times = rr.TimeColumn(WAVE, sequence=range(len(latest)))
+    robot.animate(times, roadmap.configurations[latest].numpy())
+
+
+def _log_tour(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
+    """The arm moving along connected edges, its joints as curves, and the tool's trace."""
+    import rerun as rr
+
+    points, q = tour(roadmap)
+    times = rr.TimeColumn(TOUR, duration=np.arange(len(q)) / _TOUR_RATE)
+    robot.animate(times, q.numpy())
+    for index, name in enumerate(roadmap.robot.joint_names):
+        recording.log(f"joints/{name}", rr.SeriesLines(names=name), static=True)
+        recording.send_columns(
+            f"joints/{name}", indexes=[times], columns=rr.Scalars.columns(scalars=q[:, index].numpy())
+        )
+    trace = _in_space(points.numpy())
+    recording.log(
+        "tour/path",
+        rr.CoordinateFrame(roadmap.robot.base),
+        rr.LineStrips3D([trace], colors=(255, 255, 255, 150), radii=0.03 * _spacing(roadmap)),
+        static=True,
+    )
+    recording.log("tour/tool", rr.CoordinateFrame(roadmap.robot.base), static=True)
+    recording.send_columns(
+        "tour/tool",
+        indexes=[times],
+        columns=rr.Points3D.columns(
+            positions=trace, colors=[(255, 255, 255)] * len(trace), radii=[0.2 * _spacing(roadmap)] * len(trace)
+        ),
+    )
+
+
+def _blueprint(roadmap: Roadmap) -> Any:
+    """The map with the arm at once; the expansion and the joints beside it."""
+    import rerun.blueprint as rrb
+
+    first = roadmap.robot.joint_names[0]
+    others = [f"- /roadmap/by_joint/{name}" for name in roadmap.robot.joint_names if name != first]
+    space = rrb.SpatialInformation(target_frame=roadmap.robot.urdf.root, show_axes=False)
+    look = _camera(roadmap)
+    hidden = ["- /roadmap/grid", "- /roadmap/clearance", *others]
+    main = rrb.Spatial3DView(
+        origin="/",
+        contents=["+ /robot/**", "+ /roadmap/**", "+ /tour/**", *hidden],
+        name=f"{roadmap.robot.name}, {roadmap.task.kind}: colour = {first}",
+        spatial_information=space,
+        eye_controls=look,
+        line_grid=False,
+        background=(18, 20, 26),
+    )
+    growth = rrb.Spatial3DView(
+        origin="/",
+        contents=["+ /expansion/**", "+ /robot/**"],
+        name="expansion (timeline: wave)",
+        spatial_information=space,
+        eye_controls=look,
+        line_grid=False,
+        background=(18, 20, 26),
+    )
+    clearance = rrb.Spatial3DView(
+        origin="/",
+        contents=["+ /roadmap/clearance", "+ /roadmap/broken", "+ /robot/**"],
+        name="clearance",
+        spatial_information=space,
+        eye_controls=look,
+        line_grid=False,
+        background=(18, 20, 26),
+    )
+    joints = rrb.TimeSeriesView(origin="/joints", name="joints on the tour [rad]")
+    side = rrb.Vertical(rrb.Tabs(growth, clearance, active_tab=0), joints, row_shares=[3, 2])
+    return rrb.Blueprint(
+        rrb.Horizontal(main, side, column_shares=[2, 1]),
+        rrb.TimePanel(timeline=TOUR, state="collapsed", play_state="playing", loop_mode="all"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="collapsed"),
+    )
+
+
+def _camera(roadmap: Roadmap) -> Any:
+    """From the side and above in space, from above in the plane."""
+    import rerun.blueprint as rrb
+
+    shown = roadmap.points[roadmap.resolved] if bool(roadmap.resolved.any()) else roadmap.points
+    points = _in_space(shown.numpy())
+    centre = 0.5 * (points.min(0) + points.max(0))
+    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    flat = roadmap.task.dimension == 2
+    direction = np.array([0.0, -0.02, 1.0]) if flat else np.array([0.75, -0.75, 0.45])
+    eye = centre + (0.85 if flat else 0.95) * size * direction / np.linalg.norm(direction)
+    return rrb.EyeControls3D(position=eye, look_target=centre, eye_up=(0, 1, 0) if flat else (0, 0, 1))
+
+
+def _in_space(points: np.ndarray) -> np.ndarray:
+    """Points (V, 3); those of the plane at z = 0."""
+    if points.shape[1] == 3:
+        return points
+    return np.column_stack([points, np.zeros(len(points))])
+
+
+def _spacing(roadmap: Roadmap) -> float:
+    """Median length of an edge [m]."""
+    a, b = roadmap.points[roadmap.edges].unbind(1)
+    return float((a - b).norm(dim=1).median()) if len(a) else 0.1
+
+

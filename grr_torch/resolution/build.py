@@ -1,0 +1,193 @@
+"""Building a roadmap: seeds, expansion, continuity of every edge, reachability."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+
+
+import torch
+from torch import Tensor
+
+from grr_torch.errors import ParameterError, SeedError, UnknownNameError
+from grr_torch.progress import Progress, silent
+from grr_torch.projection.continuity import is_continuous
+from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
+from grr_torch.resolution.expand import default_neighbours, expand
+from grr_torch.resolution.reachability import measure_reachability, reach, within_reach
+from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.seeds import SeedsLike
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.graph import Bounds, TaskGraph, staggered_grid
+from grr_torch.spaces.task import TaskSpace, make_task
+
+# edges whose continuity is checked together
+_EDGES_AT_ONCE = 16384
+
+
+def build(
+    robot: Robot,
+    task: TaskSpace | str | None = None,
+    *,
+    points: int | TaskGraph | None = None,
+    bounds: Bounds | None = None,
+    seeds: SeedsLike | None = None,
+    neighbours: int | None = None,
+    reachability: int = 0,
+    seed: int = 0,
+    tolerances: Tolerances = DEFAULT_TOLERANCES,
+    progress: Progress = silent,
+) -> Roadmap:
+    """Builds a roadmap with Expansion-GRR.
+
+    Whatever is not given is taken from the preset of a bundled robot; without one, task, bounds, points and seeds
+    must be given.
+
+    Args:
+        robot: The robot.
+        task: The task space, or the kind of one that the preset has.
+        points: How many vertices a staggered grid over `bounds` is asked for, or a task graph.
+        bounds: (low, high) of each axis of the grid [m].
+        seeds: (S, n) configurations that the expansion starts from.
+        neighbours: How many of the nearest vertices are averaged over; 24 in the plane and 64 in space by default.
+        reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
+        seed: Of all random draws. The same inputs give the same tensors.
+        tolerances: When a configuration counts as being at a point.
+        progress: Told what is being done and how far it is.
+
+    Returns:
+        The roadmap; its `build_seconds` leave reachability out.
+
+    Raises:
+        ParameterError: Something is missing or out of its range, or no point lies within the arm's reach.
+        SeedError: No seed can be used.
+    """
+    task, graph, seeds = _problem(robot, task, points, bounds, seeds)
+    check_task(robot, task)
+    if not bool(within_reach(robot, task, graph.points).any()):
+        centre, radius = reach(robot)
+        place = ", ".join(f"{value:.3f}" for value in centre.tolist())
+        raise ParameterError("bounds", "no point within reach", f"points within {radius:.3f} m of ({place})")
+    if reachability < 0:
+        raise ParameterError("reachability", reachability, "0 or more random starts a vertex")
+    begin = time.perf_counter()
+    expansion = expand(
+        robot, task, graph, seeds, neighbours=neighbours, tolerances=tolerances, progress=progress
+    )
+    connected = _connected(robot, task, graph, expansion.configurations, expansion.resolved, tolerances, progress)
+    seconds = time.perf_counter() - begin
+    resolved = expansion.resolved.cpu()
+    reachable = None
+    if reachability:
+        reachable = resolved.clone()
+        reachable[~resolved] = measure_reachability(
+            robot,
+            task,
+            graph.points[~resolved],
+            reachability,
+            seed=seed,
+            tolerances=tolerances,
+            progress=progress,
+        )
+    return Roadmap(
+        robot=robot,
+        task=task,
+        points=graph.points,
+        configurations=expansion.configurations.cpu(),
+        resolved=resolved,
+        edges=graph.edges,
+        connected=connected.cpu(),
+        wave=expansion.wave.cpu(),
+        reachable=reachable,
+        parameters={
+            "method": "expansion",
+            "neighbours": default_neighbours(task) if neighbours is None else neighbours,
+            "seeds": torch.as_tensor(seeds, dtype=torch.float64).tolist(),
+            "seed": seed,
+            "reachability": reachability,
+            "tolerances": asdict(tolerances),
+        },
+        build_seconds=seconds,
+    )
+
+
+def check_task(robot: Robot, task: TaskSpace) -> None:
+    """Checks that a robot can be asked for this task.
+
+    Raises:
+        ParameterError: An SE(2) task for a robot that leaves the plane.
+    """
+    if task.dimension == 2 and task.constraints > 2:
+        _, rotation = robot.forward_kinematics(robot.sample(64, torch.Generator().manual_seed(0)))
+        if not bool(((rotation[:, 2, 2] - 1.0).abs() < 1e-9).all()):
+            raise ParameterError(
+                "task", f"{task.kind} in {task.name}", f"SE(3) for {robot.name}, whose tool leaves the plane"
+            )
+
+
+def _problem(
+    robot: Robot,
+    task: TaskSpace | str | None,
+    points: int | TaskGraph | None,
+    bounds: Bounds | None,
+    seeds: SeedsLike | None,
+) -> tuple[TaskSpace, TaskGraph, SeedsLike]:
+    """Task, graph and seeds, with what was not given taken from the robot's preset."""
+    preset = robot.preset
+    kind = task.kind if isinstance(task, TaskSpace) else task or (preset.default_task if preset else None)
+    problem = preset.problems.get(kind or "") if preset else None
+    if isinstance(task, str) and preset and problem is None and bounds is None:
+        raise UnknownNameError(f"task of robot '{robot.name}'", task, tuple(preset.problems))
+    if bounds is None and problem is not None:
+        bounds = problem.bounds
+    if points is None and problem is not None:
+        points = problem.points
+    if points is None or (bounds is None and not isinstance(points, TaskGraph)):
+        raise ParameterError("points and bounds", "not given", "both, for a robot without a preset")
+    graph = points if isinstance(points, TaskGraph) else staggered_grid(bounds or (), points)
+    if seeds is None:
+        if problem is None:
+            raise SeedError(f"no seeds were given, and {robot.name} has no preset for this task")
+        seeds = problem.seeds
+    if not isinstance(task, TaskSpace):
+        if kind is None:
+            raise ParameterError("task", "not given", "'position' or 'fixed-rotation'")
+        task = make_task(kind, graph.points.shape[1], problem.rotation if problem else None)
+    if graph.points.shape[1] != task.dimension:
+        raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.dimension} for {task.name}")
+    return task, graph, seeds
+
+
+def check_edges(roadmap: Roadmap, tolerances: Tolerances, progress: Progress = silent) -> Tensor:
+    """Which edges of a roadmap are continuous, checked anew: (E,) bool."""
+    robot = roadmap.robot
+    configurations = roadmap.configurations.to(robot.lower)
+    resolved = roadmap.resolved.to(robot.device)
+    return _connected(robot, roadmap.task, roadmap.graph, configurations, resolved, tolerances, progress).cpu()
+
+
+def _connected(
+    robot: Robot,
+    task: TaskSpace,
+    graph: TaskGraph,
+    configurations: Tensor,
+    resolved: Tensor,
+    tolerances: Tolerances,
+    progress: Progress,
+) -> Tensor:
+    """Which edges between resolved vertices are continuous: (E,) bool."""
+    edges = graph.edges.to(robot.device)
+    points = graph.points.to(configurations)
+    connected = torch.zeros(len(edges), dtype=torch.bool, device=robot.device)
+    candidates = resolved[edges].all(1).nonzero()[:, 0]
+    for start in range(0, len(candidates), _EDGES_AT_ONCE):
+        progress("checking edges", start, len(candidates))
+        part = candidates[start : start + _EDGES_AT_ONCE]
+        a, b = edges[part].T
+        connected[part] = is_continuous(
+            robot, task, points[a], points[b], configurations[a], configurations[b], tolerances=tolerances
+        )
+    progress("checking edges", len(candidates), len(candidates))
+    return connected
+
+

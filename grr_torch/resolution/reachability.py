@@ -1,0 +1,81 @@
+"""Which points of a task space a robot can reach at all."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from grr_torch.errors import ParameterError
+from grr_torch.progress import Progress, silent
+from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, project_columns
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.task import TaskSpace
+
+# random starts that a point gets before those that were reached are set aside
+_ROUND = 4
+
+
+def measure_reachability(
+    robot: Robot,
+    task: TaskSpace,
+    points: Tensor,
+    attempts: int,
+    *,
+    seed: int = 0,
+    tolerances: Tolerances = DEFAULT_TOLERANCES,
+    progress: Progress = silent,
+) -> Tensor:
+    """Which points some random-start projection reaches free of self-collision: (V,) bool, on the CPU.
+
+    Args:
+        robot: The robot.
+        task: The task space.
+        points: (V, width) points.
+        attempts: Random starts for each point.
+        seed: Of the random starts.
+        tolerances: Of the projections.
+        progress: Told how many starts were tried for each point.
+
+    Raises:
+        ParameterError: `attempts` is below 1.
+    """
+    if attempts < 1:
+        raise ParameterError("reachability", attempts, "1 or more random starts a vertex")
+    generator = torch.Generator().manual_seed(seed)
+    reached = torch.zeros(len(points), dtype=torch.bool)
+    left = within_reach(robot, task, points).nonzero()[:, 0]
+    for done in range(0, attempts, _ROUND):
+        progress("measuring reachability", done, attempts)
+        starts = min(_ROUND, attempts - done)
+        guesses = robot.sample(len(left) * starts, generator).T.contiguous()
+        targets = points[left].repeat_interleave(starts, dim=0).to(guesses).T.contiguous()
+        valid = project_columns(robot, task, targets, guesses, tolerances)[1].cpu()
+        reached[left] = valid.reshape(-1, starts).any(1)
+        left = left[~reached[left]]
+    progress("measuring reachability", attempts, attempts)
+    return reached
+
+
+def within_reach(robot: Robot, task: TaskSpace, points: Tensor) -> Tensor:
+    """Points (V,) no farther from the first joint than the arm is long: what lies beyond cannot be reached."""
+    centre, radius = reach(robot)
+    d = task.dimension
+    return (points[:, :d].cpu() - centre[:d]).norm(dim=1) <= radius + 1e-6
+
+
+def reach(robot: Robot) -> tuple[Tensor, float]:
+    """A ball that holds every tool position: centre (3,) and radius [m], inf with unlimited sliding joints.
+
+    The radius is the sum of the fixed distances between successive joints, and of the lengths that joints slide.
+    """
+    tree = robot.tree
+    radius = 0.0
+    for index in tree.path:
+        joint, mount = tree.joints[index], tree.mounts[index]
+        if index != tree.path[0]:
+            radius += float(mount[5, :3].norm())
+        if not joint.revolute:
+            ends = torch.stack([robot.lower[joint.dof], robot.upper[joint.dof]])
+            radius += float((joint.multiplier * ends + joint.offset).abs().max())
+    radius += float(tree.links[tree.tool][1][:3, 3].norm())
+    return tree.mounts[tree.path[0]][5, :3].cpu(), radius

@@ -1,0 +1,113 @@
+"""The roadmap G_q: one configuration for every resolved point of a task graph."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from grr_torch.resolution.quality import Quality, measure_quality
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.graph import TaskGraph
+from grr_torch.spaces.task import TaskSpace
+
+if TYPE_CHECKING:
+    import networkx
+
+
+@dataclass(frozen=True, eq=False)
+class Roadmap:
+    """A global redundancy resolution roadmap. Immutable; its tensors live on the CPU.
+
+    Attributes:
+        robot: The robot.
+        task: The task space.
+        points: (V, width) points of the task space [m].
+        configurations: (V, n) configurations [rad or m], NaN where unresolved; continuous joints in [−π, π).
+        resolved: (V,) bool, vertices that have a configuration.
+        edges: (E, 2) vertex indices of the task graph's edges.
+        connected: (E,) bool, edges that passed the continuity check.
+        wave: (V,) int32, the wave of the expansion that resolved a vertex; −1 where unresolved.
+        reachable: (V,) bool, vertices that are resolved or were reached from a random start; None if not measured.
+        parameters: What the roadmap was built with.
+        build_seconds: How long the algorithm took.
+    """
+
+    robot: Robot
+    task: TaskSpace
+    points: Tensor
+    configurations: Tensor
+    resolved: Tensor
+    edges: Tensor
+    connected: Tensor
+    wave: Tensor
+    reachable: Tensor | None
+    parameters: Mapping[str, Any]
+    build_seconds: float
+
+    def __repr__(self) -> str:
+        return (
+            f"Roadmap({self.robot.name}, {self.task.kind} in {self.task.name}, "
+            f"{int(self.resolved.sum())} of {len(self.points)} vertices resolved, "
+            f"{int(self.connected.sum())} edges connected)"
+        )
+
+    @cached_property
+    def graph(self) -> TaskGraph:
+        """The task graph G_p."""
+        return TaskGraph(self.points, self.edges)
+
+    def quality(self) -> Quality:
+        """Connectivity, smoothness, coverage and residuals, computed from the tensors."""
+        return measure_quality(self)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the roadmap to one safetensors file (`.grr`), by an atomic rename.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        from grr_torch.resolution.roadmap_file import save_roadmap
+
+        save_roadmap(self, path)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Roadmap:
+        """Reads a `.grr` file; neither the URDF nor the meshes it was built from are needed.
+
+        Raises:
+            FileFormatError: It is missing, truncated, of another version, not a roadmap, or not consistent.
+        """
+        from grr_torch.resolution.roadmap_file import load_roadmap
+
+        return load_roadmap(path)
+
+    def to_networkx(self) -> networkx.Graph[int]:
+        """The roadmap as a networkx graph.
+
+        Nodes carry `point` and `configuration` as numpy arrays, edges the `point_distance` D_p and the
+        `configuration_distance` D_q. Only resolved vertices and connected edges are in it.
+
+        Raises:
+            ImportError: networkx is not installed.
+        """
+        import networkx
+
+        from grr_torch.spaces.configuration import distance
+
+        graph: networkx.Graph[int] = networkx.Graph()
+        points, q = self.points.numpy(), self.configurations.numpy()
+        for vertex in self.resolved.nonzero()[:, 0].tolist():
+            graph.add_node(vertex, point=points[vertex], configuration=q[vertex])
+        first, second = self.edges[self.connected].T
+        d_p = self.task.distance(self.points[first], self.points[second]).tolist()
+        d_q = distance(
+            self.configurations[first], self.configurations[second], self.robot.continuous.cpu()
+        ).tolist()
+        for a, b, p, c in zip(first.tolist(), second.tolist(), d_p, d_q, strict=True):
+            graph.add_edge(a, b, point_distance=p, configuration_distance=c)
+        return graph

@@ -1,0 +1,197 @@
+"""Roadmap files: one safetensors file with the tensors and, as metadata, everything needed to use them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from grr_torch.errors import FileFormatError, GrrError
+from grr_torch.output import atomic_write
+from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.robots.load import make_robot
+from grr_torch.robots.presets import load_preset, robot_names
+from grr_torch.robots.robot import Robot
+from grr_torch.robots.spheres import SphereModel
+from grr_torch.robots.urdf import parse_urdf
+from grr_torch.spaces.task import task_from_json
+from grr_torch.version import __version__
+
+FORMAT = "grr-torch roadmap"
+FORMAT_VERSION = 1
+
+_DTYPES = {
+    "points": torch.float64,
+    "configurations": torch.float64,
+    "resolved": torch.bool,
+    "edges": torch.int64,
+    "connected": torch.bool,
+    "wave": torch.int32,
+    "reachable": torch.bool,
+}
+_REQUIRED = tuple(name for name in _DTYPES if name != "reachable")
+
+
+def save_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
+    """Writes a roadmap; see `Roadmap.save`."""
+    tensors = {
+        name: getattr(roadmap, name).detach().cpu().contiguous().to(dtype)
+        for name, dtype in _DTYPES.items()
+        if getattr(roadmap, name) is not None
+    }
+    metadata = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "package_version": __version__,
+        "robot": _robot_to_json(roadmap.robot),
+        "task": roadmap.task.to_json(),
+        "parameters": dict(roadmap.parameters),
+        "seed": roadmap.parameters.get("seed"),
+        "build_seconds": roadmap.build_seconds,
+        "quality": roadmap.quality().to_dict(),
+        "tensors_sha256": tensors_hash(tensors),
+    }
+    with atomic_write(path) as temporary:
+        save_file(tensors, temporary, metadata={key: json.dumps(value) for key, value in metadata.items()})
+
+
+def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
+    """Reads a roadmap; see `Roadmap.load`."""
+    metadata, tensors = read_file(path)
+    _check_tensors(path, tensors)
+    try:
+        robot = _robot_from_json(metadata["robot"])
+        task = task_from_json(metadata["task"])
+        parameters, seconds = dict(metadata["parameters"]), float(metadata["build_seconds"])
+    except (KeyError, TypeError, ValueError, GrrError) as error:
+        raise FileFormatError(path, f"has metadata that cannot be used: {error}") from error
+    widths = tensors["points"].shape[1], tensors["configurations"].shape[1]
+    if widths != (task.dimension, robot.n):
+        raise FileFormatError(path, f"has rows of {widths} entries; its task and robot want {(task.dimension, robot.n)}")
+    return Roadmap(
+        robot=robot,
+        task=task,
+        points=tensors["points"],
+        configurations=tensors["configurations"],
+        resolved=tensors["resolved"],
+        edges=tensors["edges"],
+        connected=tensors["connected"],
+        wave=tensors["wave"],
+        reachable=tensors.get("reachable"),
+        parameters=parameters,
+        build_seconds=seconds,
+    )
+
+
+def read_file(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Metadata and tensors of a roadmap file.
+
+    Raises:
+        FileFormatError: It is missing, truncated, of another version, or not a roadmap.
+    """
+    if not Path(path).is_file():
+        raise FileFormatError(path, "is not a file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            if json.loads(header.get("format", "null")) != FORMAT:
+                raise FileFormatError(path, "is not a roadmap of grr-torch")
+            version = json.loads(header.get("format_version", "null"))
+            if version != FORMAT_VERSION:
+                raise FileFormatError(path, f"is of format version {version}; this version reads {FORMAT_VERSION}")
+            metadata = {key: json.loads(value) for key, value in header.items()}
+            return metadata, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise FileFormatError(path, f"is truncated or not a roadmap: {error}") from error
+    except (json.JSONDecodeError, OSError) as error:
+        raise FileFormatError(path, f"cannot be read: {error}") from error
+
+
+def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 over names, shapes and bytes of all tensors."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].contiguous()
+        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
+        digest.update(tensor.view(torch.uint8).numpy().tobytes() if tensor.numel() else b"")
+    return digest.hexdigest()
+
+
+def _robot_to_json(robot: Robot) -> dict[str, Any]:
+    return {
+        "name": robot.name,
+        "bundled": robot.preset is not None,
+        "urdf": robot.urdf.text,
+        "urdf_sha256": hashlib.sha256(robot.urdf.text.encode()).hexdigest(),
+        "urdf_directory": None if robot.preset or not robot.urdf.directory else str(robot.urdf.directory),
+        "package_dirs": [str(folder.resolve()) for folder in robot.urdf.package_dirs],
+        "base": robot.base,
+        "tool": robot.tool,
+        "held_joints": dict(robot.held_joints),
+        "spheres": robot.spheres.to_yaml() if robot.spheres else None,
+        "margin": robot.margin,
+    }
+
+
+def _robot_from_json(data: dict[str, Any]) -> Robot:
+    directory = data["urdf_directory"]
+    if data["bundled"] and data["name"] in robot_names():
+        directory = load_preset(data["name"]).urdf.parent
+    urdf = parse_urdf(
+        data["urdf"].encode(),
+        source=data["name"],
+        directory=None if directory is None else Path(directory),
+        package_dirs=data["package_dirs"],
+    )
+    spheres = data["spheres"]
+    return make_robot(
+        urdf,
+        name=data["name"],
+        base=data["base"],
+        tool=data["tool"],
+        held_joints=data["held_joints"],
+        spheres=None if spheres is None else SphereModel.parse(spheres, urdf.links, source=data["name"]),
+        margin=float(data["margin"]),
+        device=torch.device("cpu"),
+        dtype=torch.float64,
+    )
+
+
+def _check_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> None:
+    """Names, types, shapes, and what must agree between them.
+
+    Raises:
+        FileFormatError: Something does not.
+    """
+
+    def demand(holds: bool, reason: str) -> None:
+        if not holds:
+            raise FileFormatError(path, reason)
+
+    missing = [name for name in _REQUIRED if name not in tensors]
+    demand(not missing, f"lacks the tensors {', '.join(missing)}")
+    for name, tensor in tensors.items():
+        demand(name in _DTYPES, f"has an unknown tensor '{name}'")
+        demand(tensor.dtype == _DTYPES[name], f"tensor '{name}' is {tensor.dtype}, not {_DTYPES[name]}")
+    vertices, count = len(tensors["points"]), len(tensors["edges"])
+    for name in ("points", "configurations", "edges"):
+        demand(tensors[name].ndim == 2, f"tensor '{name}' is not a table")
+    lengths = {"configurations": vertices, "resolved": vertices, "wave": vertices, "connected": count}
+    lengths |= {"reachable": vertices} if "reachable" in tensors else {}
+    for name, length in lengths.items():
+        demand(len(tensors[name]) == length, f"tensor '{name}' has {len(tensors[name])} rows, not {length}")
+    edges, resolved = tensors["edges"], tensors["resolved"]
+    inside = bool(((edges >= 0) & (edges < vertices)).all()) and edges.shape[1] == 2
+    demand(inside, "has edges to vertices that do not exist")
+    demand(bool(tensors["points"].isfinite().all()), "has points that are not finite")
+    finite = tensors["configurations"].isfinite().all(1)
+    demand(bool((finite == resolved).all()), "has resolved vertices without a finite configuration, or the reverse")
+    demand(bool(resolved[edges[tensors["connected"]]].all()), "has connected edges to unresolved vertices")

@@ -1,0 +1,129 @@
+"""Seeds: configurations that the expansion starts from."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from grr_torch.errors import FileFormatError, GrrWarning, SeedError
+from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.configuration import distance
+from grr_torch.spaces.graph import TaskGraph
+from grr_torch.spaces.task import TaskSpace
+
+# vertices near its tool that a seed is projected to
+_TRIED = 8
+
+SeedsLike = Tensor | np.ndarray[Any, Any] | Sequence[Sequence[float]]
+
+
+def read_seeds(path: str | os.PathLike[str]) -> Tensor:
+    """Reads seeds from a file: one configuration a line, commas or blanks between values (.csv, .txt), or .npy.
+
+    Raises:
+        FileFormatError: It is missing or does not hold a table of numbers.
+    """
+    path = Path(path)
+    try:
+        if path.suffix == ".npy":
+            table = np.load(path, allow_pickle=False)
+        else:
+            text = path.read_text(encoding="utf-8").replace(",", " ")
+            rows = [line.split("#")[0].split() for line in text.splitlines()]
+            table = np.array([[float(value) for value in row] for row in rows if row], dtype=np.float64)
+    except OSError as error:
+        raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
+    except (ValueError, EOFError) as error:
+        raise FileFormatError(path, f"is not a table of numbers with rows of one length: {error}") from error
+    if table.ndim != 2 or table.size == 0 or table.dtype.kind not in "fi":
+        raise FileFormatError(path, "is not a table of numbers with one seed a row")
+    return torch.from_numpy(table.astype(np.float64))
+
+
+def check_seeds(robot: Robot, seeds: SeedsLike) -> Tensor:
+    """Seeds as (S, n), finite.
+
+    Raises:
+        SeedError: There are none, they have another length than n, or hold NaN.
+    """
+    try:
+        table = torch.as_tensor(seeds, dtype=robot.dtype)
+    except (ValueError, TypeError) as error:
+        raise SeedError(f"seeds are not a table of numbers: {error}") from error
+    if table.ndim != 2 or table.shape[1] != robot.n:
+        raise SeedError(
+            f"seeds have shape {tuple(table.shape)}; valid: (S, {robot.n}), in the order of joints "
+            f"{', '.join(robot.joint_names)}"
+        )
+    if len(table) == 0:
+        raise SeedError("no seeds were given; valid: at least one configuration")
+    bad = (~table.isfinite()).any(1).nonzero()[:, 0].tolist()
+    if bad:
+        raise SeedError(f"seeds {_names(bad)} hold NaN or infinite values", dict.fromkeys(bad, "not finite"))
+    return table.to(robot.device)
+
+
+def place_seeds(
+    robot: Robot, task: TaskSpace, graph: TaskGraph, seeds: Tensor, tolerances: Tolerances
+) -> tuple[Tensor, Tensor]:
+    """Projects each seed to the vertex nearest to its tool position, or the next nearest of eight that it reaches.
+
+    Of seeds that share a vertex, the one that had to move least is kept. Seeds that cannot be used are named in a
+    GrrWarning.
+
+    Returns:
+        Vertices (K,) and their configurations (K, n).
+
+    Raises:
+        SeedError: No seed can be used.
+    """
+    position, _ = robot.forward_kinematics(seeds)
+    nearest = graph.nearest(position[:, : task.dimension], _TRIED)
+    tried = nearest.shape[1]
+    targets = graph.points[nearest].to(seeds).reshape(-1, task.dimension)
+    guesses = seeds.repeat_interleave(tried, dim=0)
+    solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
+    valid = valid.reshape(len(seeds), tried)
+    usable = valid.any(1)
+    _report(robot, seeds, usable)
+    first = valid.int().argmax(1)
+    rows = torch.arange(len(seeds), device=seeds.device)
+    configurations = solved.T.reshape(len(seeds), tried, robot.n)[rows, first]
+    vertices = nearest.to(seeds.device)[rows, first]
+    moved = torch.where(usable, distance(seeds, configurations, robot.continuous), torch.inf)
+    chosen: dict[int, int] = {}
+    for index in torch.argsort(moved, stable=True)[: int(usable.sum())].tolist():
+        chosen.setdefault(int(vertices[index]), index)
+    kept = torch.tensor(sorted(chosen.values()), device=seeds.device)
+    return vertices[kept], configurations[kept]
+
+
+def _report(robot: Robot, seeds: Tensor, usable: Tensor) -> None:
+    """Warns of seeds that cannot be used.
+
+    Raises:
+        SeedError: None can.
+    """
+    unusable = (~usable).nonzero()[:, 0].tolist()
+    if not unusable:
+        return
+    reasons = {
+        index: "in self-collision" if collides else "the task cannot be met near it"
+        for index, collides in zip(unusable, robot.in_self_collision(seeds[unusable]).tolist(), strict=True)
+    }
+    text = "; ".join(f"seed {index}: {reason}" for index, reason in reasons.items())
+    if len(unusable) == len(seeds):
+        raise SeedError(f"none of {len(seeds)} seeds can be used: {text}", reasons)
+    warnings.warn(f"{len(unusable)} of {len(seeds)} seeds are not used: {text}", GrrWarning, stacklevel=4)
+
+
+def _names(indices: Sequence[int]) -> str:
+    return ", ".join(map(str, indices))

@@ -1,0 +1,163 @@
+"""The task graph G_p: points of a task space and the edges between them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from grr_torch.errors import ParameterError
+
+Bounds = Sequence[tuple[float, float]]
+
+_MOST_POINTS = 20_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class TaskGraph:
+    """Points and edges; immutable.
+
+    Attributes:
+        points: (V, d) positions [m], float64, on the CPU.
+        edges: (E, 2) vertex indices, smaller one first.
+    """
+
+    points: Tensor
+    edges: Tensor
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points.numpy())
+
+    def neighbours(self, k: int) -> tuple[Tensor, Tensor]:
+        """The k nearest other vertices of each vertex, nearest first.
+
+        Args:
+            k: How many; fewer are given where the graph has fewer vertices.
+
+        Returns:
+            Indices (V, k) and distances (V, k) [m].
+        """
+        k = min(k, len(self.points) - 1)
+        distances, indices = self._tree.query(self.points.numpy(), k=range(1, k + 2), workers=-1)
+        # the vertex itself comes first: no two vertices coincide
+        return torch.from_numpy(indices[:, 1:]), torch.from_numpy(distances[:, 1:])
+
+    def nearest(self, points: Tensor, k: int = 1) -> Tensor:
+        """Indices (*batch, k) of the vertices nearest to each point (*batch, d), nearest first."""
+        ranks = range(1, min(k, len(self.points)) + 1)
+        return torch.from_numpy(np.asarray(self._tree.query(points.cpu().numpy(), k=ranks, workers=-1)[1]))
+
+    @cached_property
+    def adjacency(self) -> tuple[Tensor, Tensor]:
+        """Both directions of all edges, sorted by start: (2E,) starts and (2E,) ends."""
+        both = torch.cat([self.edges, self.edges.flip(1)])
+        order = torch.argsort(both[:, 0] * len(self.points) + both[:, 1])
+        return both[order, 0], both[order, 1]
+
+
+def check_bounds(bounds: Bounds) -> tuple[tuple[float, float], ...]:
+    """Bounds as pairs of floats.
+
+    Raises:
+        ParameterError: They are not two or three finite intervals of positive length.
+    """
+    pairs = tuple((float(low), float(high)) for low, high in bounds)
+    valid = "two or three intervals, low < high, finite, in metres"
+    if len(pairs) not in (2, 3) or not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in pairs):
+        raise ParameterError("bounds", pairs, valid)
+    return pairs
+
+
+def check_count(points: int) -> int:
+    """The number of vertices asked for.
+
+    Raises:
+        ParameterError: It is below 1 or beyond what could be held.
+    """
+    if isinstance(points, bool) or not isinstance(points, int) or not 1 <= points <= _MOST_POINTS:
+        raise ParameterError("points", points, f"a whole number from 1 to {_MOST_POINTS:,}")
+    return points
+
+
+def staggered_grid(bounds: Bounds, n: int) -> TaskGraph:
+    """Corners of a grid of nearly cubic cells and the cells' centres, at least n vertices in all.
+
+    Corners are joined to their neighbours along every axis, centres to the corners of their cell. Of the grids whose
+    counts of cells lie next to those of exactly cubic cells, the smallest that has n vertices is taken.
+
+    Args:
+        bounds: (low, high) of each axis [m].
+        n: How many vertices are asked for.
+
+    Raises:
+        ParameterError: The bounds are empty or n is not valid.
+    """
+    pairs, n = check_bounds(bounds), check_count(n)
+    cells = _cells([high - low for low, high in pairs], n)
+    lines = [np.linspace(low, high, count + 1) for (low, high), count in zip(pairs, cells, strict=True)]
+    middles = [0.5 * (line[1:] + line[:-1]) for line in lines]
+    points = np.concatenate([_mesh(lines), _mesh(middles)])
+    corner = np.arange(math.prod(count + 1 for count in cells)).reshape([count + 1 for count in cells])
+    centre = corner.size + np.arange(math.prod(cells)).reshape(cells)
+    edges: list[np.ndarray] = []
+    for axis in range(len(cells)):
+        first, second = np.delete(corner, -1, axis), np.delete(corner, 0, axis)
+        edges.append(np.stack([first.ravel(), second.ravel()], axis=1))
+    for shift in itertools.product((0, 1), repeat=len(cells)):
+        window = tuple(slice(s, s + count) for s, count in zip(shift, cells, strict=True))
+        edges.append(np.stack([corner[window].ravel(), centre.ravel()], axis=1))
+    return TaskGraph(torch.from_numpy(points), torch.from_numpy(np.concatenate(edges)))
+
+
+def random_graph(bounds: Bounds, n: int, *, k: int, generator: torch.Generator | None = None) -> TaskGraph:
+    """n points drawn uniformly within bounds, each joined to its k nearest.
+
+    Args:
+        bounds: (low, high) of each axis [m].
+        n: How many points.
+        k: How many neighbours each is joined to.
+        generator: Source of randomness; torch's global one by default.
+
+    Raises:
+        ParameterError: The bounds are empty, or n or k is not valid.
+    """
+    pairs, n = check_bounds(bounds), check_count(n)
+    if not 1 <= k < n:
+        raise ParameterError("k", k, f"1 to {n - 1}: each point is joined to others")
+    low, high = torch.tensor(pairs, dtype=torch.float64).T
+    points = low + (high - low) * torch.rand(n, len(pairs), dtype=torch.float64, generator=generator)
+    indices = TaskGraph(points, torch.empty(0, 2, dtype=torch.long)).neighbours(k)[0]
+    pairs_of = torch.stack([torch.arange(n)[:, None].expand_as(indices), indices], dim=-1).reshape(-1, 2)
+    return TaskGraph(points, torch.unique(pairs_of.sort(dim=1).values, dim=0))
+
+
+def _cells(lengths: Sequence[float], n: int) -> tuple[int, ...]:
+    """Counts of cells along each axis: floor or ceiling of the real counts that give n vertices of cubic cells."""
+
+    def vertices(counts: Sequence[float]) -> float:
+        return math.prod(count + 1 for count in counts) + math.prod(counts)
+
+    low, high = 0.0, max(lengths)
+    while vertices([length / high for length in lengths]) > n:
+        high *= 2.0
+    for _ in range(100):
+        edge = 0.5 * (low + high)
+        if vertices([length / edge for length in lengths]) > n:
+            low = edge
+        else:
+            high = edge
+    choices = itertools.product(*({max(1, math.floor(x / high)), math.ceil(x / high)} for x in lengths))
+    enough = [counts for counts in choices if vertices(counts) >= n]
+    return min(enough, key=lambda counts: (vertices(counts), counts))
+
+
+def _mesh(lines: Sequence[np.ndarray]) -> np.ndarray:
+    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
