@@ -16,6 +16,7 @@ from grr_torch.resolution.roadmap import Roadmap
 
 WAVE, TOUR = "wave", "tour"
 _TOUR_RATE = 25.0
+_WAVES_PER_SECOND = 2.0
 
 
 def record_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
@@ -68,7 +69,7 @@ def _log_map(recording: Any, roadmap: Roadmap) -> None:
 
     points = _in_space(roadmap.points.numpy())
     resolved = roadmap.resolved.numpy()
-    radius = 0.11 * _spacing(roadmap)
+    radius = _radius(roadmap)
     q = roadmap.configurations[roadmap.resolved]
     frame = rr.CoordinateFrame(roadmap.robot.base)
 
@@ -85,7 +86,7 @@ def _log_map(recording: Any, roadmap: Roadmap) -> None:
     edges = roadmap.edges.numpy()
     connected = roadmap.connected.numpy()
     broken = ~connected & resolved[edges].all(1)
-    thin = 0.011 * _spacing(roadmap)
+    thin = 0.1 * radius
     log("connected", rr.LineStrips3D(points[edges[connected]], colors=colours.CONNECTED, radii=thin))
     log("broken", rr.LineStrips3D(points[edges[broken]], colors=colours.BROKEN, radii=4.0 * thin))
     log("grid", rr.LineStrips3D(points[edges], colors=colours.GRID, radii=0.5 * thin))
@@ -102,24 +103,22 @@ def _log_waves(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
     edges = roadmap.edges[roadmap.connected].numpy()
     edge_wave = wave[edges].max(1) if len(edges) else np.empty(0, dtype=np.int32)
     frame = rr.CoordinateFrame(roadmap.robot.base)
-    radius = 0.11 * _spacing(roadmap)
+    radius = _radius(roadmap)
     latest: list[int] = []
-    recording.log("expansion", frame, static=True)
+    for entity in ("vertices", "edges"):
+        recording.log(f"expansion/{entity}", frame, static=True)
     for step in range(int(wave.max()) + 1):
+        # the map also grows at the start of the tour, so that it is seen without changing the timeline
         recording.set_time(WAVE, sequence=step)
+        recording.set_time(TOUR, duration=step / _WAVES_PER_SECOND)
         done = (wave >= 0) & (wave <= step)
         shade = np.where((wave[done] == step)[:, None], (255, 176, 0), (90, 150, 200)).astype(np.uint8)
-        recording.log("expansion/vertices", frame, rr.Points3D(points[done], colors=shade, radii=radius))
+        recording.log("expansion/vertices", rr.Points3D(points[done], colors=shade, radii=radius))
         lines = points[edges[edge_wave <= step]]
-        recording.log(
-            "expansion/edges",
-            frame,
-            rr.LineStrips3D(lines, colors=colours.CONNECTED, radii=0.011 * _spacing(roadmap)),
-        )
+        recording.log("expansion/edges", rr.LineStrips3D(lines, colors=colours.CONNECTED, radii=0.1 * radius))
         latest.append(int(np.flatnonzero(wave == step)[0]) if (wave == step).any() else latest[-1])
     recording.reset_time()
-    times = rr.TimeColumn(WAVE, sequence=range(len(latest)))
-    robot.animate(times, roadmap.configurations[latest].numpy())
+    robot.animate(rr.TimeColumn(WAVE, sequence=range(len(latest))), roadmap.configurations[latest].numpy())
 
 
 def _log_tour(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
@@ -129,8 +128,9 @@ def _log_tour(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
     points, q = tour(roadmap)
     times = rr.TimeColumn(TOUR, duration=np.arange(len(q)) / _TOUR_RATE)
     robot.animate(times, q.numpy())
-    for index, name in enumerate(roadmap.robot.joint_names):
-        recording.log(f"joints/{name}", rr.SeriesLines(names=name), static=True)
+    hues = colours.circle(2.0 * np.pi * np.arange(roadmap.robot.n) / roadmap.robot.n)
+    for index, (name, hue) in enumerate(zip(roadmap.robot.joint_names, hues, strict=True)):
+        recording.log(f"joints/{name}", rr.SeriesLines(names=name, colors=hue), static=True)
         recording.send_columns(
             f"joints/{name}", indexes=[times], columns=rr.Scalars.columns(scalars=q[:, index].numpy())
         )
@@ -138,7 +138,7 @@ def _log_tour(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
     recording.log(
         "tour/path",
         rr.CoordinateFrame(roadmap.robot.base),
-        rr.LineStrips3D([trace], colors=(255, 255, 255, 150), radii=0.03 * _spacing(roadmap)),
+        rr.LineStrips3D([trace], colors=(255, 255, 255, 150), radii=0.25 * _radius(roadmap)),
         static=True,
     )
     recording.log("tour/tool", rr.CoordinateFrame(roadmap.robot.base), static=True)
@@ -146,7 +146,7 @@ def _log_tour(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
         "tour/tool",
         indexes=[times],
         columns=rr.Points3D.columns(
-            positions=trace, colors=[(255, 255, 255)] * len(trace), radii=[0.2 * _spacing(roadmap)] * len(trace)
+            positions=trace, colors=[(255, 255, 255)] * len(trace), radii=[1.6 * _radius(roadmap)] * len(trace)
         ),
     )
 
@@ -157,36 +157,23 @@ def _blueprint(roadmap: Roadmap) -> Any:
 
     first = roadmap.robot.joint_names[0]
     others = [f"- /roadmap/by_joint/{name}" for name in roadmap.robot.joint_names if name != first]
-    space = rrb.SpatialInformation(target_frame=roadmap.robot.urdf.root, show_axes=False)
-    look = _camera(roadmap)
+
+    def space(name: str, *contents: str) -> Any:
+        return rrb.Spatial3DView(
+            origin="/",
+            contents=["+ /robot/**", *contents],
+            name=name,
+            spatial_information=rrb.SpatialInformation(target_frame=roadmap.robot.urdf.root, show_axes=False),
+            eye_controls=_camera(roadmap),
+            line_grid=False,
+            background=(18, 20, 26),
+        )
+
     hidden = ["- /roadmap/grid", "- /roadmap/clearance", *others]
-    main = rrb.Spatial3DView(
-        origin="/",
-        contents=["+ /robot/**", "+ /roadmap/**", "+ /tour/**", *hidden],
-        name=f"{roadmap.robot.name}, {roadmap.task.kind}: colour = {first}",
-        spatial_information=space,
-        eye_controls=look,
-        line_grid=False,
-        background=(18, 20, 26),
-    )
-    growth = rrb.Spatial3DView(
-        origin="/",
-        contents=["+ /expansion/**", "+ /robot/**"],
-        name="expansion (timeline: wave)",
-        spatial_information=space,
-        eye_controls=look,
-        line_grid=False,
-        background=(18, 20, 26),
-    )
-    clearance = rrb.Spatial3DView(
-        origin="/",
-        contents=["+ /roadmap/clearance", "+ /roadmap/broken", "+ /robot/**"],
-        name="clearance",
-        spatial_information=space,
-        eye_controls=look,
-        line_grid=False,
-        background=(18, 20, 26),
-    )
+    title = f"{roadmap.robot.name}, {roadmap.task.kind}: colour = {first}"
+    main = space(title, "+ /roadmap/**", "+ /tour/**", *hidden)
+    growth = space("expansion", "+ /expansion/**")
+    clearance = space("clearance", "+ /roadmap/clearance", "+ /roadmap/broken")
     joints = rrb.TimeSeriesView(origin="/joints", name="joints on the tour [rad]")
     side = rrb.Vertical(rrb.Tabs(growth, clearance, active_tab=0), joints, row_shares=[3, 2])
     return rrb.Blueprint(
@@ -218,9 +205,7 @@ def _in_space(points: np.ndarray) -> np.ndarray:
     return np.column_stack([points, np.zeros(len(points))])
 
 
-def _spacing(roadmap: Roadmap) -> float:
-    """Median length of an edge [m]."""
+def _radius(roadmap: Roadmap) -> float:
+    """Radius [m] of a vertex as it is drawn: an eighth of the median edge."""
     a, b = roadmap.points[roadmap.edges].unbind(1)
-    return float((a - b).norm(dim=1).median()) if len(a) else 0.1
-
-
+    return 0.125 * float((a - b).norm(dim=1).median()) if len(a) else 0.01

@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 
 from grr_torch.errors import ParameterError, UrdfError
 from grr_torch.progress import Progress, silent
-from grr_torch.robots.geometry import Mask, Points, Solid, link_meshes
+from grr_torch.robots.geometry import Mask, Points, Solid, link_meshes, surface_points
 from grr_torch.robots.spheres import Sphere
 from grr_torch.robots.tighten_spheres import tighten, unit_sphere
 from grr_torch.robots.urdf import Urdf
@@ -101,32 +101,32 @@ def _fit_link(urdf: Urdf, link: str, count: int | None, tolerance: float | None,
     else:
         chosen = _cover(distances, depths + tolerance, len(targets))
         assert chosen is not None
-    samples = [solid, *(Solid.sampled(meshes, _spacing(size), seed + 100 * k) for k in range(1, 6))]
+    dense = [surface_points(meshes, _spacing(size) / 3.0, seed + k) for k in (1, 2, 3)]
     # descent ends in a local minimum: the best of several starts is kept
     rng = np.random.default_rng(seed)
     fits: list[LinkFit] = []
     for start in range(_STARTS):
         moved = candidates[chosen] + rng.normal(scale=0.008 * size * start, size=(len(chosen), 3))
         centres, radii = tighten(moved, depths[chosen] + tolerance, solid, inner, size, seed + start)
-        fits.append(_closed(centres, radii, targets, samples))
+        spheres = _closed(centres, radii, targets, dense[0], dense[1])
+        fits.append(measure(spheres, solid, dense[2]))
     return min(fits, key=lambda fit: fit.mean_excess + 0.25 * fit.max_excess)
 
 
-def _closed(centres: Points, radii: Points, targets: Points, samples: list[Solid]) -> LinkFit:
-    """Spheres resized until no sampled point of the geometry is outside, rounded and measured."""
+def _closed(
+    centres: Points, radii: Points, targets: Points, surface: Points, check: Points
+) -> tuple[Sphere, ...]:
+    """Spheres resized until no point of the geometry is outside, and rounded."""
     centres = np.round(centres, _DECIMALS)
-    radii = _shrunk(centres, radii, targets)
-    for sample in samples[:-2]:
-        radii = _grown(centres, radii, sample.boundary)
-    # what one more sample finds outside bounds what lies between the samples
-    radii = radii + _outside(samples[-2].boundary, centres, radii)
+    radii = _grown(centres, _shrunk(centres, radii, targets), surface)
+    # what another sample finds outside bounds what lies between the points
+    radii = radii + 2.0 * _outside(check, centres, radii)
     radii = np.ceil(radii * 10**_DECIMALS) / 10**_DECIMALS
-    spheres = tuple(
+    return tuple(
         Sphere((float(x), float(y), float(z)), float(r))
         for (x, y, z), r in zip(centres, radii, strict=True)
         if r > 0.0
     )
-    return measure(spheres, samples[-1])
 
 
 def _spacing(size: float) -> float:
@@ -134,8 +134,8 @@ def _spacing(size: float) -> float:
     return min(size / 100.0, 0.002)
 
 
-def measure(spheres: tuple[Sphere, ...], solid: Solid) -> LinkFit:
-    """Measures how tightly spheres cover a solid."""
+def measure(spheres: tuple[Sphere, ...], solid: Solid, surface: Points) -> LinkFit:
+    """Measures how tightly spheres cover a solid, and whether they cover points on its surface."""
     centres = np.array([sphere.center for sphere in spheres])
     radii = np.array([sphere.radius for sphere in spheres])
     surface = np.vstack([centre + radius * unit_sphere(500) for centre, radius in zip(centres, radii, strict=True)])
@@ -147,13 +147,14 @@ def measure(spheres: tuple[Sphere, ...], solid: Solid) -> LinkFit:
         spheres,
         mean_excess=float(np.average(excess, weights=area[outer])) if outer.any() else 0.0,
         max_excess=float(excess.max()) if outer.any() else 0.0,
-        uncovered=_outside(solid.boundary, centres, radii),
+        uncovered=_outside(surface, centres, radii),
     )
 
 
 def _outside(points: Points, centres: Points, radii: Points) -> float:
     """How far [m] the points stick out of the spheres at most."""
-    return float(max((cdist(points, centres) - radii).min(1).max(), 0.0))
+    parts = np.array_split(points, 1 + len(points) // 100_000)
+    return max(0.0, *(float((cdist(part, centres) - radii).min(1).max()) for part in parts))
 
 
 def _candidates(solid: Solid, size: float) -> tuple[Points, Points]:
@@ -212,10 +213,12 @@ def _shrunk(centres: Points, radii: Points, targets: Points) -> Points:
 
 def _grown(centres: Points, radii: Points, points: Points) -> Points:
     """Radii large enough that no point is left outside: the nearest sphere takes it in."""
-    distances = cdist(points, centres)
-    owner = (distances - radii).argmin(1)
-    for k in range(len(centres)):
-        radii[k] = max(radii[k], distances[owner == k, k].max(initial=0.0))
+    for part in np.array_split(points, 1 + len(points) // 100_000):
+        distances = cdist(part, centres)
+        owner = (distances - radii).argmin(1)
+        radii = np.array(
+            [max(radii[k], distances[owner == k, k].max(initial=0.0)) for k in range(len(centres))]
+        )
     return radii
 
 

@@ -64,6 +64,17 @@ def _read_mesh(urdf: Urdf, link: str, shape: Shape) -> Trimesh:
     return mesh
 
 
+def surface_points(meshes: list[Trimesh], spacing: float, seed: int) -> Points:
+    """Points about every `spacing` metres on the surfaces of all parts, and their corners: (S, 3) [m]."""
+    import trimesh
+
+    points: list[Points] = []
+    for i, mesh in enumerate(meshes):
+        count = int(np.clip(2.0 * mesh.area / spacing**2, 200, 400_000))
+        points += [trimesh.sample.sample_surface(mesh, count, seed=seed + i)[0], mesh.vertices]
+    return np.vstack(points)
+
+
 @dataclass(frozen=True)
 class Solid:
     """The union of closed meshes, as points.

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
-from xml.sax.saxutils import quoteattr
 
 import torch
 
 from grr_torch.errors import ParameterError, UnknownNameError, UrdfError
-from grr_torch.robots.kinematics import compile_tree, degrees_of_freedom, joint_motion
+from grr_torch.robots.chain import serial_chain
+from grr_torch.robots.kinematics import compile_tree, degrees_of_freedom
 from grr_torch.robots.presets import Preset, load_preset, robot_names
 from grr_torch.robots.robot import Robot
 from grr_torch.robots.spheres import SphereModel
 from grr_torch.robots.urdf import Joint, Urdf, read_urdf
-
-if TYPE_CHECKING:
-    from pytorch_kinematics import SerialChain
 
 
 def load_robot(
@@ -99,7 +93,7 @@ def make_robot(
     """Makes a `Robot` from a validated URDF; see `load_robot`."""
     held = _held(urdf, held_joints)
     urdf.path(base, tool)  # names what is wrong before pytorch-kinematics sees it
-    chain = _chain(urdf, base, tool, held).to(dtype=dtype, device=device)
+    chain = serial_chain(urdf, base, tool, held, dtype=dtype, device=device)
     path = [urdf.joints[joint.name] for joint in chain.get_joints(exclude_fixed=False) if joint.name in urdf.joints]
     moving = degrees_of_freedom(path, held)
     if not moving:
@@ -171,35 +165,3 @@ def _add_mimic_limits(urdf: Urdf, joint: Joint, figures: dict[str, list[float]])
     driver = figures[source.name]
     driver[0], driver[1] = max(driver[0], ends[0]), min(driver[1], ends[1])
     driver[2] = min(driver[2], joint.velocity / abs(multiplier))
-
-
-def _chain(urdf: Urdf, base: str, tool: str, held: Mapping[str, float]) -> SerialChain:
-    """The chain by pytorch-kinematics, from a URDF reduced to what it reads and complains of nothing in."""
-    import pytorch_kinematics
-
-    lines = [f"<robot name={quoteattr(urdf.name)}>"]
-    lines += [f"<link name={quoteattr(link)}/>" for link in urdf.links]
-    lines += [_reduced(joint, held) for joint in urdf.joints.values()]
-    text = "\n".join([*lines, "</robot>"]).encode()
-    with contextlib.redirect_stderr(io.StringIO()):
-        chain = pytorch_kinematics.build_serial_chain_from_urdf(text, tool, base)
-    return cast("SerialChain", chain)
-
-
-def _reduced(joint: Joint, held: Mapping[str, float]) -> str:
-    from trimesh.transformations import euler_from_matrix
-
-    kind = "fixed" if joint.name in held else joint.kind
-    origin = joint.origin
-    if joint.name in held:
-        origin = origin @ joint_motion(joint, held[joint.name])
-    xyz = " ".join(f"{value:.17g}" for value in origin[:3, 3])
-    rpy = " ".join(f"{value:.17g}" for value in euler_from_matrix(origin, "sxyz"))
-    axis = " ".join(f"{value:.17g}" for value in joint.axis)
-    lower, upper = max(joint.lower, -1e9), min(joint.upper, 1e9)
-    return (
-        f"<joint name={quoteattr(joint.name)} type='{kind}'><parent link={quoteattr(joint.parent)}/>"
-        f"<child link={quoteattr(joint.child)}/><origin xyz='{xyz}' rpy='{rpy}'/><axis xyz='{axis}'/>"
-        f"<limit lower='{lower:.17g}' upper='{upper:.17g}' effort='0' velocity='{min(joint.velocity, 1e9):.17g}'/>"
-        "</joint>"
-    )

@@ -34,8 +34,7 @@ class Robot:
         urdf: The URDF it was read from.
         base: Link in whose frame poses are given.
         tool: Link whose pose is controlled.
-        chain: The same chain as a `pytorch_kinematics.SerialChain` (float32 offsets, mimic joints as degrees of
-            freedom; the kernels here use the URDF's float64 figures).
+        chain: The chain as a `pytorch_kinematics.SerialChain`, in which mimic joints are degrees of freedom.
         joint_names: The n joints of a configuration.
         lower: (n,) lower position limits; −inf where there is none.
         upper: (n,) upper position limits; inf where there is none.

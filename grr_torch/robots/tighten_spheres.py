@@ -9,7 +9,7 @@ from torch.nn.functional import grid_sample
 
 from grr_torch.robots.geometry import Points, Solid
 
-_STEPS = 2500
+_STEPS = 2000
 # nodes of the distance field along each axis
 _NODES = 72
 # surface points that each step looks at, drawn anew, so that no gap hides between them

@@ -1,0 +1,193 @@
+"""Reading URDFs: every feature, and every way they can be wrong."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+import trimesh
+from random_robots import BOX_ARM
+
+import grr_torch
+from grr_torch.errors import MeshNotFoundError, ParameterError, UnknownNameError, UrdfError
+
+HINGE = '<joint name="{n}" type="{t}"><parent link="{p}"/><child link="{c}"/><axis xyz="0 0 1"/>{x}</joint>'
+
+
+def hinge(name, parent, child, kind="revolute", extra='<limit lower="-1" upper="1" effort="1" velocity="2"/>'):
+    return HINGE.format(n=name, t=kind, p=parent, c=child, x=extra)
+
+
+def robot_text(*parts, links=("a", "b")):
+    return '<robot name="r">' + "".join(f'<link name="{link}"/>' for link in links) + "".join(parts) + "</robot>"
+
+
+@pytest.fixture
+def load(tmp_path):
+    def read(text, **options):
+        path = tmp_path / "robot.urdf"
+        path.write_text(text)
+        return grr_torch.load_robot(path, **options)
+
+    return read
+
+
+def test_limits_are_those_of_the_urdf(load):
+    robot = load(robot_text(hinge("j", "a", "b")))
+    assert (robot.lower.item(), robot.upper.item(), robot.velocity_limits.item()) == (-1.0, 1.0, 2.0)
+
+
+def test_a_limit_without_lower_and_upper_is_no_limit(load):
+    robot = load(robot_text(hinge("j", "a", "b", "continuous", '<limit effort="1" velocity="2"/>')))
+    assert (robot.lower.item(), robot.upper.item()) == (-math.inf, math.inf)
+    assert robot.continuous.item()
+
+
+def test_limits_of_a_continuous_joint_do_not_count(load):
+    wide = '<limit lower="-3.14" upper="3.14" effort="1" velocity="2"/>'
+    robot = load(robot_text(hinge("j", "a", "b", "continuous", wide)))
+    assert robot.continuous.item()
+    assert math.isinf(robot.upper.item())
+
+
+def test_a_revolute_joint_over_a_full_turn_is_not_continuous(load):
+    robot = load(robot_text(hinge("j", "a", "b", extra='<limit lower="-6.3" upper="6.3" effort="1" velocity="1"/>')))
+    assert not robot.continuous.item()
+    assert robot.upper.item() == 6.3
+
+
+def test_joints_outside_the_chain_are_held(load):
+    text = robot_text(hinge("j", "a", "b"), hinge("side", "b", "c"), links="abc")
+    assert load(text, tool="b").joint_names == ("j",)
+    held = load(text, tool="b", held_joints={"side": 0.5}).link_poses(torch.zeros(1))["c"]
+    assert math.atan2(held[1, 0], held[0, 0]) == pytest.approx(0.5)
+
+
+def test_a_held_joint_of_the_chain_is_no_degree_of_freedom(load):
+    text = robot_text(hinge("i", "a", "b"), hinge("j", "b", "c"), links="abc")
+    robot = load(text, held_joints={"i": 0.25})
+    assert robot.joint_names == ("j",)
+    assert robot.chain.get_joint_parameter_names() == ["j"]
+    _, rotation = robot.forward_kinematics(torch.zeros(1))
+    assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.25)
+
+
+def test_a_mimic_joint_follows_and_narrows_the_limits(load):
+    mimic = '<limit lower="-1" upper="1" effort="1" velocity="2"/><mimic joint="i" multiplier="2" offset="0.5"/>'
+    robot = load(robot_text(hinge("i", "a", "b"), hinge("j", "b", "c", extra=mimic), links="abc"))
+    assert robot.joint_names == ("i",)
+    # −1 ≤ 2 q + 0.5 ≤ 1 and |2 q̇| ≤ 2
+    assert (robot.lower.item(), robot.upper.item(), robot.velocity_limits.item()) == (-0.75, 0.25, 1.0)
+    _, rotation = robot.forward_kinematics(torch.tensor([0.1]))
+    assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.1 + 0.7)
+
+
+def test_base_may_lie_inside_the_tree(load):
+    text = robot_text(hinge("i", "a", "b"), hinge("j", "b", "c"), links="abc")
+    robot = load(text, base="b", held_joints={"i": 0.3})
+    assert robot.joint_names == ("j",)
+    pose = robot.link_poses(torch.zeros(1))["a"]
+    assert math.atan2(pose[1, 0], pose[0, 0]) == pytest.approx(-0.3)
+
+
+@pytest.mark.parametrize(
+    ("place", "name"),
+    [
+        ("meshes/part.stl", "meshes/part.stl"),
+        ("meshes/part.stl", "{root}/meshes/part.stl"),
+        ("meshes/part.stl", "file://{root}/meshes/part.stl"),
+        ("packages/my_arm/part.stl", "package://my_arm/part.stl"),
+    ],
+)
+def test_meshes_are_found_wherever_they_may_be(load, tmp_path, place, name):
+    (tmp_path / place).parent.mkdir(parents=True)
+    trimesh.creation.box().export(tmp_path / place)
+    mesh = name.format(root=tmp_path)
+    link = f'<link name="b"><collision><geometry><mesh filename="{mesh}"/></geometry></collision></link>'
+    text = robot_text(link, hinge("j", "a", "b"), links="a")
+    folders = [tmp_path / "packages"]
+    assert load(text, package_dirs=folders).urdf.mesh_path(mesh, "b").is_file()
+    if mesh.startswith("package"):
+        assert load(text, package_dirs=[tmp_path / "packages" / "my_arm"]).n == 1
+
+
+def test_a_missing_mesh_is_named_with_where_it_was_sought(load, tmp_path):
+    link = '<link name="b"><visual><geometry><mesh filename="package://arm/b.stl"/></geometry></visual></link>'
+    with pytest.raises(MeshNotFoundError) as caught:
+        load(robot_text(link, hinge("j", "a", "b"), links="a"), package_dirs=[tmp_path])
+    assert caught.value.filename == "package://arm/b.stl"
+    assert caught.value.searched == (tmp_path / "arm" / "b.stl",)
+    assert str(tmp_path / "arm" / "b.stl") in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("", "is empty"),
+        ("<robot name='r'><link", "not well-formed"),
+        ("<sdf/>", "root element is <sdf>"),
+        ("<robot><link name='a'/></robot>", "no name"),
+        ("<robot name='r'/>", "has no <link>"),
+        ("<robot name='r'><link/></robot>", "malformed"),
+        (robot_text(links="a"), "no movable joint"),
+        (robot_text(hinge("j", "a", "b", "fixed")), "no movable joint"),
+        (robot_text(hinge("j", "a", "b", "floating")), "'floating'; supported: revolute"),
+        (robot_text(hinge("j", "a", "b", "planar")), "'planar'"),
+        (robot_text(hinge("j", "a", "b", extra='<limit lower="1" upper="-1" velocity="1"/>')), "lower=1.0, upper=-1.0"),
+        (robot_text(hinge("j", "a", "b", extra='<limit lower="nan" upper="1" velocity="1"/>')), "lower=nan"),
+        (robot_text(hinge("j", "a", "c")), "'c', which does not exist"),
+        (robot_text(hinge("j", "a", "b"), links="abc"), "more than one root"),
+        (robot_text(hinge("i", "a", "b"), hinge("j", "b", "a")), "loop"),
+        (robot_text(hinge("j", "a", "b"), links="aab"), "more than one link named 'a'"),
+        (robot_text(hinge("j", "a", "b", extra='<mimic joint="x"/>')), "mimics 'x'"),
+        (robot_text(hinge("j", "a", "b").replace("0 0 1", "0 0 0")), "axis of length zero"),
+        (robot_text(hinge("j", "a", "b").replace("0 0 1", "0 0 nan")), "not finite"),
+        (BOX_ARM.replace('radius="0.05" length', 'radius="-1" length'), "valid: positive"),
+        (BOX_ARM.replace("<sphere", "<capsule"), "malformed"),
+    ],
+)
+def test_a_bad_urdf_is_a_clear_error(load, text, complaint):
+    with pytest.raises(UrdfError, match=complaint) as caught:
+        load(text)
+    assert caught.value.reason in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_urdf_is_a_clear_error(tmp_path):
+    with pytest.raises(UrdfError, match="No such file"):
+        grr_torch.load_robot(tmp_path / "none.urdf")
+
+
+def test_an_unknown_robot_lists_the_known_and_the_nearest():
+    with pytest.raises(UnknownNameError, match="Did you mean 'kinova'") as caught:
+        grr_torch.load_robot("kinovaa")
+    assert caught.value.known == ("kinova", "planar_3", "planar_5")
+
+
+@pytest.mark.parametrize("frame", ["tool", "base"])
+def test_an_unknown_frame_lists_the_links(load, frame):
+    with pytest.raises(UnknownNameError, match="unknown link 'z'. Known: a, b"):
+        load(robot_text(hinge("j", "a", "b")), **{frame: "z"})
+
+
+def test_a_base_that_is_not_above_the_tool_is_an_error(load):
+    with pytest.raises(UrdfError, match="'b' does not lie above 'a'"):
+        load(robot_text(hinge("j", "a", "b")), base="b", tool="a")
+
+
+def test_a_tree_with_several_ends_asks_for_the_tool(load):
+    text = robot_text(hinge("i", "a", "b"), hinge("j", "a", "c"), links="abc")
+    with pytest.raises(UnknownNameError, match="Ends of chains: b, c"):
+        load(text)
+
+
+@pytest.mark.parametrize("value", [math.nan, 7.0])
+def test_held_values_lie_within_limits(load, value):
+    with pytest.raises(ParameterError, match=r"-1.0 to 1.0"):
+        load(robot_text(hinge("j", "a", "b")), held_joints={"j": value})
+
+
+def test_an_unknown_held_joint_is_an_error(load):
+    with pytest.raises(UnknownNameError, match="unknown joint 'k'"):
+        load(robot_text(hinge("j", "a", "b")), held_joints={"k": 0.0})
