@@ -23,6 +23,9 @@ def spheres(
     samples: Annotated[
         int, typer.Option(help="Random configurations, to tell which links can touch.")
     ] = 50_000,
+    starts: Annotated[
+        int, typer.Option(help="With --spheres: descents from different starts, the best is kept; 0 is quick.")
+    ] = 3,
     seed: Annotated[int, typer.Option(help="Of all random draws.")] = 0,
     package_dir: Annotated[list[Path] | None, typer.Option(help="Folder for package:// meshes; repeatable.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -36,19 +39,19 @@ def spheres(
     """
     from grr_torch.output import check_writable
     from grr_torch.robots.contact_pairs import find_pairs
-    from grr_torch.robots.fit_spheres import fit_spheres
+    from grr_torch.robots.fit_spheres import DEFAULT_COUNT, fit_spheres
     from grr_torch.robots.spheres import SphereModel
     from grr_torch.robots.urdf import read_urdf
 
     check_writable(out)
     robot = read_urdf(urdf, package_dir or ())
     with progress_bar() as progress:
-        fits = fit_spheres(robot, count=count, tolerance=tolerance, seed=seed, progress=progress)
+        fits = fit_spheres(robot, count=count, tolerance=tolerance, starts=starts, seed=seed, progress=progress)
         by_link = {link: fit.spheres for link, fit in fits.items()}
         pairs = find_pairs(robot, by_link, samples=samples, seed=seed, progress=progress)
     model = SphereModel(by_link, frozenset(pair.links for pair in pairs if pair.ignored))
-    options = f"--spheres {count}" if count is not None else f"--tolerance {tolerance}" if tolerance else ""
-    model.save(out, comment=f"Made by: grr-torch spheres {urdf.name} {options} --samples {samples} --seed {seed}")
+    size = f"--tolerance {tolerance}" if tolerance is not None else f"--spheres {count or DEFAULT_COUNT} --starts {starts}"
+    model.save(out, comment=f"Made by: grr-torch spheres {urdf.name} {size} --samples {samples} --seed {seed}")
     if as_json:
         print_json(
             {

@@ -92,8 +92,9 @@ def place_seeds(
     guesses = seeds.repeat_interleave(tried, dim=0)
     solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
     valid = valid.reshape(len(seeds), tried)
-    usable = valid.any(1)
-    _report(robot, seeds, usable)
+    wrong = {"in self-collision": robot.in_self_collision(seeds), "outside joint limits": ~robot.within_limits(seeds)}
+    usable = valid.any(1) & ~torch.stack(list(wrong.values())).any(0)
+    _report(usable, wrong)
     first = valid.int().argmax(1)
     rows = torch.arange(len(seeds), device=seeds.device)
     configurations = solved.T.reshape(len(seeds), tried, robot.n)[rows, first]
@@ -106,23 +107,22 @@ def place_seeds(
     return vertices[kept], configurations[kept]
 
 
-def _report(robot: Robot, seeds: Tensor, usable: Tensor) -> None:
-    """Warns of seeds that cannot be used.
+def _report(usable: Tensor, wrong: dict[str, Tensor]) -> None:
+    """Warns of seeds that cannot be used, each with the first thing that is wrong with it.
 
     Raises:
         SeedError: None can.
     """
-    unusable = (~usable).nonzero()[:, 0].tolist()
-    if not unusable:
+    reasons: dict[int, str] = {}
+    for index in (~usable).nonzero()[:, 0].tolist():
+        found = [reason for reason, seeds in wrong.items() if bool(seeds[index])]
+        reasons[index] = (found or ["the task cannot be met near it"])[0]
+    if not reasons:
         return
-    reasons = {
-        index: "in self-collision" if collides else "the task cannot be met near it"
-        for index, collides in zip(unusable, robot.in_self_collision(seeds[unusable]).tolist(), strict=True)
-    }
     text = "; ".join(f"seed {index}: {reason}" for index, reason in reasons.items())
-    if len(unusable) == len(seeds):
-        raise SeedError(f"none of {len(seeds)} seeds can be used: {text}", reasons)
-    warnings.warn(f"{len(unusable)} of {len(seeds)} seeds are not used: {text}", GrrWarning, stacklevel=4)
+    if len(reasons) == len(usable):
+        raise SeedError(f"none of {len(usable)} seeds can be used: {text}", reasons)
+    warnings.warn(f"{len(reasons)} of {len(usable)} seeds are not used: {text}", GrrWarning, stacklevel=4)
 
 
 def _names(indices: Sequence[int]) -> str:

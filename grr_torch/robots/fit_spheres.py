@@ -8,6 +8,7 @@ such spheres, and for a number of spheres it is a search for the smallest τ.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -20,12 +21,13 @@ from grr_torch.robots.spheres import Sphere
 from grr_torch.robots.tighten_spheres import tighten, unit_sphere
 from grr_torch.robots.urdf import Urdf
 
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
 # spheres a link, unless told otherwise
-_COUNT = 16
+DEFAULT_COUNT = 16
 # spheres are written with this many decimals [m]; radii are rounded up
 _DECIMALS = 5
-# descents from different starts, of which the best is kept
-_STARTS = 3
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ def fit_spheres(
     *,
     count: int | None = None,
     tolerance: float | None = None,
+    starts: int = 3,
     seed: int = 0,
     progress: Progress = silent,
 ) -> dict[str, LinkFit]:
@@ -59,6 +62,7 @@ def fit_spheres(
         urdf: The robot.
         count: At most this many spheres a link, with the least excess found (16 if neither is given).
         tolerance: As few spheres as found whose surface lies at most this far [m] from the geometry.
+        starts: With `count`, descents from different starts, of which the best is kept; 0: the set cover as it is.
         seed: For the sampled surface points.
         progress: Told how many links are fitted.
 
@@ -76,40 +80,44 @@ def fit_spheres(
         raise ParameterError("spheres", count, "1 to 1000 a link")
     if tolerance is not None and not 1e-4 <= tolerance < np.inf:
         raise ParameterError("tolerance", tolerance, "0.0001 m or more")
+    if starts < 0:
+        raise ParameterError("starts", starts, "0 or more")
     links = [link for link, shapes in urdf.collisions.items() if shapes]
     if not links:
         raise UrdfError(urdf.name, "no link has collision geometry to fit spheres to")
+    meshes = {link: link_meshes(urdf, link) for link in links}  # what is missing or broken is said before the work
     fits: dict[str, LinkFit] = {}
     for done, link in enumerate(links):
         progress("fitting spheres", done, len(links))
-        fits[link] = _fit_link(urdf, link, _COUNT if tolerance is None and count is None else count, tolerance, seed)
+        fits[link] = _fit_link(meshes[link], DEFAULT_COUNT if tolerance is None and count is None else count, tolerance, starts, seed)
     progress("fitting spheres", len(links), len(links))
     return fits
 
 
-def _fit_link(urdf: Urdf, link: str, count: int | None, tolerance: float | None, seed: int) -> LinkFit:
-    meshes = link_meshes(urdf, link)
+def _fit_link(
+    meshes: list[Trimesh], count: int | None, tolerance: float | None, starts: int, seed: int
+) -> LinkFit:
     size = float(np.linalg.norm(np.ptp(np.vstack([mesh.bounds for mesh in meshes]), axis=0)))
     solid = Solid.sampled(meshes, _spacing(size), seed)
     candidates, depths = _candidates(solid, size)
     inner = candidates[:: max(1, len(candidates) // 1000)]
     targets = np.vstack([solid.boundary[_thinned(solid.boundary, 4000)], inner])
     distances = cdist(candidates, targets)
-    if tolerance is None:
-        assert count is not None
-        chosen, tolerance = _least_tolerance(distances, depths, count, size)
-    else:
-        chosen = _cover(distances, depths + tolerance, len(targets))
+    if count is None:
+        assert tolerance is not None
+        chosen, starts = _cover(distances, depths + tolerance, len(targets)), 0
         assert chosen is not None
-    dense = [surface_points(meshes, _spacing(size) / 3.0, seed + k) for k in (1, 2, 3)]
-    # descent ends in a local minimum: the best of several starts is kept
+    else:
+        chosen, tolerance = _least_tolerance(distances, depths, count, size)
+    dense = [surface_points(meshes, _spacing(size) / 2.0, seed + k) for k in (1, 2, 3)]
+    covers = [(candidates[chosen], depths[chosen] + tolerance)]
     rng = np.random.default_rng(seed)
-    fits: list[LinkFit] = []
-    for start in range(_STARTS):
-        moved = candidates[chosen] + rng.normal(scale=0.008 * size * start, size=(len(chosen), 3))
-        centres, radii = tighten(moved, depths[chosen] + tolerance, solid, inner, size, seed + start)
-        spheres = _closed(centres, radii, targets, dense[0], dense[1])
-        fits.append(measure(spheres, solid, dense[2]))
+    for start in range(starts):
+        # descent ends in a local minimum, so it is begun from more than one place
+        centres, radii = covers[0]
+        moved = centres + rng.normal(scale=0.008 * size * start, size=centres.shape)
+        covers.append(tighten(moved, radii, solid, inner, size, seed + start))
+    fits = [measure(_closed(*cover, targets, dense[0], dense[1]), solid, dense[2]) for cover in covers]
     return min(fits, key=lambda fit: fit.mean_excess + 0.25 * fit.max_excess)
 
 

@@ -9,9 +9,11 @@ from torch.nn.functional import grid_sample
 
 from grr_torch.robots.geometry import Points, Solid
 
-_STEPS = 2000
+_STEPS = 1500
 # nodes of the distance field along each axis
 _NODES = 72
+# points on all spheres together, at which the excess is taken
+_SURFACE = 3200
 # surface points that each step looks at, drawn anew, so that no gap hides between them
 _DRAWN = 3000
 # all lengths below are shares of the link's size
@@ -43,7 +45,7 @@ def tighten(
     r = torch.tensor(radii, requires_grad=True)
     field = _DistanceField(solid, size)
     boundary, inside = torch.tensor(solid.boundary), torch.tensor(inner)
-    directions = _directions(160)
+    directions = _directions(max(16, _SURFACE // len(c)))
     own = torch.arange(len(c)).repeat_interleave(len(directions))
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam([c, r], lr=_RATE * size)

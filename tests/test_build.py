@@ -1,0 +1,208 @@
+"""Building roadmaps: the paper's four problems, determinism, and what may be given."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import grr_torch
+from grr_torch.errors import GrrWarning, ParameterError, SeedError, UnknownNameError
+from grr_torch.projection.project import project
+from grr_torch.resolution.expand import expand
+from grr_torch.resolution.reachability import reach
+from grr_torch.resolution.seeds import read_seeds
+from grr_torch.spaces.configuration import distance, weighted_average
+from grr_torch.spaces.graph import TaskGraph
+
+# reachable vertices and edges between them, as the arm's own shapes allow
+PROBLEMS = [
+    ("planar_5", "position", 761, 2168, 1.0, 1.0, 5.675),
+    ("planar_5", "fixed-rotation", 488, 1379, 1.0, 1.0, 9.7),
+    ("kinova", "position", 1267, 6105, 0.995, 0.995, 2.6),
+    ("kinova", "fixed-rotation", 430, 1896, 0.98, 0.965, 4.75),
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "reachable", "edges", "coverage", "connectivity", "smoothness"), PROBLEMS)
+def test_the_paper_s_problems(name, kind, reachable, edges, coverage, connectivity, smoothness):
+    roadmap = grr_torch.build(grr_torch.load_robot(name), kind)
+    quality = roadmap.quality()
+    assert quality.resolved_vertices >= coverage * reachable
+    assert quality.connected_edges >= connectivity * edges
+    assert quality.smoothness <= smoothness
+    assert quality.max_position_error <= 1e-4
+    assert quality.max_rotation_error <= 1e-3
+    assert quality.joint_limit_violations == 0
+    assert quality.self_collisions == 0
+    if name == "kinova":
+        assert quality.min_self_collision_distance >= 0.002
+
+
+def test_reachable_vertices_are_found_and_nothing_else(planar_5):
+    """The planar arm reaches the disc of radius 0.5, and resolves all of it."""
+    roadmap = grr_torch.build(planar_5, "position", points=300, reachability=8)
+    inside = roadmap.points.norm(dim=1) <= 0.5 + 1e-9
+    assert torch.equal(roadmap.reachable, inside)
+    quality = roadmap.quality()
+    assert quality.coverage == 1.0
+    assert quality.reachable_edges == int(inside[roadmap.edges].all(1).sum())
+
+
+def test_the_same_inputs_give_the_same_bytes(kinova):
+    first, second = (grr_torch.build(kinova, "position", points=400, reachability=2, seed=5) for _ in range(2))
+    for name in ("points", "configurations", "resolved", "edges", "connected", "wave", "reachable"):
+        assert getattr(first, name).numpy().tobytes() == getattr(second, name).numpy().tobytes()
+
+
+def test_connected_edges_pass_the_check_and_the_rest_does_not(kinova):
+    roadmap = grr_torch.build(kinova, "fixed-rotation", points=1500)
+    both = roadmap.resolved[roadmap.edges].all(1)
+    assert not bool(roadmap.connected[~both].any())
+    a, b = roadmap.edges[both].T
+    p, q = roadmap.points, roadmap.configurations
+    found = grr_torch.is_continuous(kinova, roadmap.task, p[a], p[b], q[a], q[b])
+    assert torch.equal(found, roadmap.connected[both])
+
+
+def test_waves_grow_along_edges_from_the_seeds(planar_roadmap):
+    wave = planar_roadmap.wave
+    assert torch.equal(wave >= 0, planar_roadmap.resolved)
+    a, b = planar_roadmap.edges.T
+    earliest = torch.full_like(wave, 1000)
+    for start, end in ((a, b), (b, a)):
+        earlier = torch.where(wave[start] >= 0, wave[start], 1000)
+        earliest = earliest.scatter_reduce(0, end, earlier, "amin")
+    later = wave > 0
+    assert bool((earliest[later] < wave[later]).all())
+
+
+def test_one_wave_is_the_projected_average_of_resolved_neighbours(planar_5):
+    """A hand-made graph of two seeds and a point between them, nearer to the first."""
+    q = torch.tensor([[0.3, 0.4, 0.4, 0.4, 0.4], [0.9, 0.4, 0.4, 0.4, 0.4]], dtype=torch.float64)
+    ends = planar_5.forward_kinematics(q)[0][:, :2]
+    middle = 0.6 * ends[:1] + 0.4 * ends[1:]
+    graph = TaskGraph(torch.cat([ends, middle]), torch.tensor([[0, 2], [1, 2]]))
+    task = grr_torch.Position(2)
+    expansion = expand(planar_5, task, graph, q)
+    d = (ends - middle).norm(dim=1)
+    weights = (d.max() / d) ** 2
+    average = weighted_average(q, weights, planar_5.continuous)
+    expected, _ = project(planar_5, task, middle[0], average)
+    assert distance(expansion.configurations[2], expected, planar_5.continuous) < 1e-12
+    assert expansion.wave.tolist() == [0, 0, 1]
+
+
+def test_quality_figures_are_what_they_say(planar_roadmap):
+    quality = planar_roadmap.quality()
+    a, b = planar_roadmap.edges[planar_roadmap.connected].T
+    q, p = planar_roadmap.configurations, planar_roadmap.points
+    slopes = distance(q[a], q[b], planar_roadmap.robot.continuous) / (p[a] - p[b]).norm(dim=1)
+    assert quality.smoothness == pytest.approx(float(slopes.mean()))
+    assert quality.smoothness_max == pytest.approx(float(slopes.max()))
+    assert quality.smoothness_median == pytest.approx(float(slopes.quantile(0.5)))
+    assert quality.connectivity == quality.connected_edges / quality.reachable_edges
+
+
+def test_without_reachability_nothing_is_claimed(planar_5):
+    quality = grr_torch.build(planar_5, "position", points=50).quality()
+    assert quality.reachable_vertices is None
+    assert quality.coverage is None
+    assert quality.connectivity is None
+    assert quality.connectivity_resolved is not None
+
+
+def test_a_robot_of_one_s_own_is_built_from_its_urdf(box_arm):
+    robot = grr_torch.load_robot(box_arm)
+    roadmap = grr_torch.build(
+        robot,
+        grr_torch.Position(3),
+        points=300,
+        bounds=[(-0.6, 0.6), (-0.6, 0.6), (0.1, 1.0)],
+        seeds=[[0.0, 1.0, 0.5], [2.0, 1.0, 0.5]],
+    )
+    assert roadmap.quality().resolved_vertices > 20
+
+
+def test_a_graph_of_one_s_own_is_used(planar_5, generator):
+    graph = grr_torch.random_graph([(-0.4, 0.4)] * 2, 150, k=6, generator=generator)
+    roadmap = grr_torch.build(planar_5, "position", points=graph)
+    assert torch.equal(roadmap.points, graph.points)
+    assert roadmap.quality().resolved_vertices == int((graph.points.norm(dim=1) <= 0.5).sum())
+
+
+def test_reach_holds_every_tool_position(kinova, generator):
+    centre, radius = reach(kinova)
+    position = kinova.forward_kinematics(kinova.sample(5000, generator))[0]
+    assert (position - centre).norm(dim=1).max() <= radius
+
+
+def test_unusable_seeds_are_named_and_the_build_goes_on(kinova, generator):
+    good = grr_torch.load_preset("kinova").problems["position"].seeds
+    q = kinova.sample(5000, generator)
+    colliding = q[kinova.self_collision_distance(q) < -0.01][0]
+    beyond = torch.tensor([0.0, 3.0, 0, 0, 0, 0, 0])
+    seeds = torch.stack([torch.tensor(good[0]), colliding, beyond, torch.tensor(good[1])])
+    wanted = "2 of 4 seeds are not used: seed 1: in self-collision; seed 2: outside joint limits"
+    with pytest.warns(GrrWarning, match=wanted):
+        roadmap = grr_torch.build(kinova, "position", points=300, seeds=seeds)
+    assert bool(roadmap.resolved.any())
+
+
+@pytest.mark.parametrize(
+    ("seeds", "complaint"),
+    [
+        ([[0.0, 0.0]], r"valid: \(S, 5\)"),
+        ([], "seeds have shape|no seeds"),
+        ([[math.nan] * 5, [0.0] * 5], "seeds 0 hold NaN"),
+        ([[0.0] * 5, [0.0] * 4], "not a table"),
+        ("abc", "not a table"),
+    ],
+)
+def test_bad_seeds_are_errors(planar_5, seeds, complaint):
+    with pytest.raises(SeedError, match=complaint):
+        grr_torch.build(planar_5, "position", seeds=seeds)
+
+
+def test_seeds_that_all_collide_are_an_error(kinova, generator):
+    q = kinova.sample(5000, generator)
+    q = q[kinova.self_collision_distance(q) < -0.04][:3]
+    with pytest.raises(SeedError, match="none of 3 seeds can be used: seed 0: in self-collision") as caught:
+        grr_torch.build(kinova, "position", seeds=q)
+    assert set(caught.value.reasons) == {0, 1, 2}
+
+
+def test_seed_files_are_read(tmp_path):
+    (tmp_path / "a.csv").write_text("# two\n0, 0.1, 0.2\n\n1 1.1 1.2\n")
+    assert read_seeds(tmp_path / "a.csv").tolist() == [[0.0, 0.1, 0.2], [1.0, 1.1, 1.2]]
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"bounds": [(5, 6), (5, 6), (5, 6)]}, "points within 1.151 m of"),
+        ({"points": 0}, "points: got 0"),
+        ({"neighbours": 0}, "neighbours: got 0"),
+        ({"reachability": -1}, "reachability: got -1"),
+        ({"bounds": [(1, -1), (0, 1), (0, 1)]}, "low < high"),
+        ({"task": grr_torch.Position(2)}, "2 for R2"),
+        ({"task": grr_torch.FixedRotation(2), "bounds": [(-1, 1), (-1, 1)]}, "tool leaves the plane"),
+    ],
+)
+def test_bad_parameters_are_errors(kinova, options, complaint):
+    task = options.pop("task", "position")
+    with pytest.raises(ParameterError, match=complaint):
+        grr_torch.build(kinova, task, **options)
+
+
+def test_an_unknown_task_lists_the_known(kinova):
+    with pytest.raises(UnknownNameError, match="Known: position, fixed-rotation"):
+        grr_torch.build(kinova, "rotation")
+
+
+def test_a_robot_without_preset_must_be_told_everything(box_arm):
+    with pytest.raises(ParameterError, match="points and bounds"):
+        grr_torch.build(grr_torch.load_robot(box_arm), "position")
+    with pytest.raises(SeedError, match="no preset"):
+        grr_torch.build(grr_torch.load_robot(box_arm), "position", points=50, bounds=[(-0.5, 0.5)] * 3)

@@ -1,0 +1,209 @@
+"""The command line as a person uses it: each test starts the program anew."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+import grr_torch
+from grr_torch.cli.main import join_bounds
+
+PROGRAM = [sys.executable, "-m", "grr_torch.cli.main"]
+QUALITY = set(grr_torch.Roadmap.quality.__annotations__) and {
+    "vertices",
+    "edges",
+    "resolved_vertices",
+    "reachable_vertices",
+    "coverage",
+    "connected_edges",
+    "reachable_edges",
+    "connectivity",
+    "resolved_edges",
+    "connectivity_resolved",
+    "smoothness",
+    "smoothness_median",
+    "smoothness_p99",
+    "smoothness_max",
+    "max_position_error",
+    "max_rotation_error",
+    "min_self_collision_distance",
+    "self_collisions",
+    "joint_limit_violations",
+}
+
+
+def run(*arguments, cwd):
+    environment = {**os.environ, "COLUMNS": "200"}
+    words = [str(argument) for argument in arguments]
+    return subprocess.run([*PROGRAM, *words], cwd=cwd, capture_output=True, text=True, env=environment, check=False)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("built")
+    return folder, run("build", "--robot", "planar_5", "--points", 200, "--reachability", 4, "--json", cwd=folder)
+
+
+def test_build_writes_a_roadmap_and_a_recording_and_prints_one_object(built):
+    folder, result = built
+    assert result.returncode == 0, result.stderr
+    data = json.loads(result.stdout)
+    assert set(data) == QUALITY | {"build_seconds", "out", "record"}
+    assert (data["out"], data["record"]) == ("planar_5.grr", "planar_5.rrd")
+    assert sorted(path.name for path in folder.iterdir()) == ["planar_5.grr", "planar_5.rrd"]
+    stored = grr_torch.Roadmap.load(folder / "planar_5.grr").quality().to_dict()
+    assert {name: data[name] for name in QUALITY} == pytest.approx(stored)
+
+
+def test_info_shows_verifies_and_speaks_json(built):
+    folder, _ = built
+    shown = run("info", "planar_5.grr", cwd=folder)
+    assert shown.returncode == 0
+    assert "connectivity" in shown.stdout
+    verified = run("info", "planar_5.grr", "--verify", "--json", cwd=folder)
+    data = json.loads(verified.stdout)
+    assert data["verified"] is True
+    assert set(data) >= QUALITY
+
+
+def test_info_verify_catches_an_edited_file(built, tmp_path):
+    from safetensors.torch import load_file, save_file
+    from test_roadmap_file import header
+
+    source, copy = built[0] / "planar_5.grr", tmp_path / "edited.grr"
+    tensors = load_file(source)
+    tensors["configurations"] += 1e-3
+    save_file(tensors, copy, metadata=header(source))
+    result = run("info", copy, "--verify", cwd=tmp_path)
+    assert result.returncode == 2
+    assert "not consistent with itself: tensors, quality" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_view_saves_a_recording(built, tmp_path):
+    result = run("view", built[0] / "planar_5.grr", "--save", tmp_path / "v.rrd", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "v.rrd").stat().st_size > 10_000
+
+
+def test_robots_lists_the_bundled_ones(tmp_path):
+    assert set(json.loads(run("robots", "--json", cwd=tmp_path).stdout)) == {"kinova", "planar_3", "planar_5"}
+    assert "fixed-rotation (default): 3,100 points" in run("robots", cwd=tmp_path).stdout
+
+
+def test_a_robot_never_seen_before_is_built_from_its_urdf(box_arm, tmp_path):
+    (tmp_path / "seeds.csv").write_text("1.0, 0.5\n1.5, 0.2\n")
+    words = "--task position --points 80 --bounds -0.6 0.6 -0.6 0.6 0.2 1.0 --hold turn=0.5 --base base --tool tip"
+    result = run(
+        "build", "--robot", box_arm, *words.split(), "--seeds", "seeds.csv", "--margin", "0.01", "--no-record", cwd=tmp_path
+    )
+    assert result.returncode == 0, result.stderr
+    roadmap = grr_torch.Roadmap.load(tmp_path / "box_arm.grr")
+    assert roadmap.robot.joint_names == ("elbow", "wrist")
+    assert roadmap.robot.margin == 0.01
+    assert not (tmp_path / "box_arm.rrd").exists()
+
+
+def test_a_rotation_is_taken(tmp_path):
+    words = "--robot planar_5 --task fixed-rotation --rotation 0 0 1.2 --points 100 --no-record --json"
+    result = run("build", *words.split(), cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert grr_torch.Roadmap.load(tmp_path / "planar_5.grr").task.rpy == (0.0, 0.0, 1.2)
+
+
+def test_spheres_are_fitted_and_used(box_arm, tmp_path):
+    fitted = run("spheres", box_arm, "--out", "s.yaml", "--spheres", 3, "--starts", 0, "--samples", 300, cwd=tmp_path)
+    assert fitted.returncode == 0, fitted.stderr
+    assert "hand – upper" in fitted.stdout
+    robot = grr_torch.load_robot(box_arm, spheres=tmp_path / "s.yaml")
+    assert robot.spheres.checked
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("build --robot kinva", "unknown robot 'kinva'. Did you mean 'kinova'?"),
+        ("build --robot none.urdf", "none.urdf: cannot be read"),
+        ("build --robot empty.urdf", "empty.urdf: is empty"),
+        ("build --robot planar_5 --tool hand", "unknown link 'hand'. Known: base_link"),
+        ("build --robot planar_5 --base link_9", "unknown link 'link_9'"),
+        ("build --robot planar_5 --task rotate", "unknown task of robot 'planar_5' 'rotate'. Known: position"),
+        ("build --robot planar_5 --points 0", "points: got 0"),
+        ("build --robot planar_5 --points 99999999999", "points: got 99999999999"),
+        ("build --robot planar_5 --bounds 1 -1 0 1", "low < high"),
+        ("build --robot planar_5 --bounds 1 nan 0 1", "low < high"),
+        ("build --robot planar_5 --bounds 0 1 0", "four or six numbers"),
+        ("build --robot planar_5 --bounds 8 9 8 9", "no point within reach"),
+        ("build --robot planar_5 --seeds none.csv", "none.csv: cannot be read"),
+        ("build --robot planar_5 --seeds short.csv", "valid: (S, 5)"),
+        ("build --robot planar_5 --seeds nan.csv", "seeds 0 hold NaN"),
+        ("build --robot planar_5 --seeds words.csv", "is not a table of numbers"),
+        ("build --robot planar_5 --hold joint_1", "JOINT=VALUE"),
+        ("build --robot planar_5 --hold elbow=1", "unknown joint 'elbow'"),
+        ("build --robot planar_5 --margin -1", "margin: got -1.0"),
+        ("build --robot planar_5 --device tpu9", "--device: got tpu9"),
+        ("build --robot planar_5 --out no/such/f.grr", "folder 'no/such' does not exist"),
+        ("build --robot planar_5 --out .", "it is a folder"),
+        ("build --robot planar_5 --task position --rotation 0 0 1", "none for the task 'position'"),
+        ("build --robot kinova --spheres words.csv", "is not a sphere file"),
+        ("build --robot planar_5 --reachability -3", "reachability: got -3"),
+        ("info none.grr", "none.grr: is not a file"),
+        ("info words.csv", "truncated or not a roadmap"),
+        ("view words.csv --save x.rrd", "truncated or not a roadmap"),
+        ("spheres none.urdf --out s.yaml", "none.urdf: cannot be read"),
+        ("build", "Missing option"),
+        ("bild", "No such command"),
+    ],
+)
+def test_a_mistake_is_one_clear_line_and_exit_code_2(tmp_path, words, complaint):
+    (tmp_path / "empty.urdf").touch()
+    (tmp_path / "short.csv").write_text("0 0 0")
+    (tmp_path / "nan.csv").write_text("0 0 0 0 nan")
+    (tmp_path / "words.csv").write_text("no numbers here")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    result = run(*words.split(), cwd=tmp_path)
+    assert result.returncode == 2
+    assert complaint in result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+    if result.stderr.startswith("error: "):
+        assert result.stderr.count("\n") == 1
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_ctrl_c_leaves_no_file(tmp_path):
+    words = ["build", "--robot", "kinova", "--points", "200000"]
+    process = subprocess.Popen([*PROGRAM, *words], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    time.sleep(9)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", [[], ["build"], ["info"], ["view"], ["robots"], ["spheres"]])
+def test_help_has_an_example(tmp_path, command):
+    result = run(*command, "--help", cwd=tmp_path)
+    assert result.returncode == 0
+    assert "grr-torch" in result.stdout
+    assert not command or "Example:" in result.stdout
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys, grr_torch.cli.main; print([m for m in ('torch', 'numpy', 'rerun', 'trimesh') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_the_numbers_after_bounds_become_one_argument():
+    assert join_bounds("build --bounds -1 1 -2e-1 .5 --points 3".split()) == [
+        "build", "--bounds=-1 1 -2e-1 .5", "--points", "3",
+    ]  # fmt: skip
+    assert join_bounds(["--bounds", "-1 1 0 2"]) == ["--bounds", "-1 1 0 2"]

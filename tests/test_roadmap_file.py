@@ -1,0 +1,199 @@
+"""Roadmap files: they come back equal, need nothing else, and do not lie unnoticed."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+import grr_torch
+from grr_torch.errors import FileFormatError, GrrError, OutputError
+from grr_torch.output import atomic_write
+from grr_torch.resolution.verify import verify_file
+
+TENSORS = ("points", "configurations", "resolved", "edges", "connected", "wave", "reachable")
+
+
+@pytest.fixture
+def saved(planar_roadmap, tmp_path):
+    path = tmp_path / "map.grr"
+    planar_roadmap.save(path)
+    return path
+
+
+def header(path):
+    with safe_open(path, framework="pt") as file:
+        return dict(file.metadata())
+
+
+def test_a_roadmap_comes_back_equal(planar_roadmap, saved):
+    again = grr_torch.Roadmap.load(saved)
+    for name in TENSORS:
+        assert torch.equal(getattr(again, name).nan_to_num(9.9), getattr(planar_roadmap, name).nan_to_num(9.9))
+    assert again.task == planar_roadmap.task
+    assert again.parameters == planar_roadmap.parameters
+    assert again.quality() == planar_roadmap.quality()
+
+
+def test_the_robot_comes_back_whole(kinova, tmp_path, generator):
+    robot = grr_torch.load_robot("kinova", held_joints={"joint_7": 0.3}, margin=0.01)
+    seeds = [seed[:6] for seed in grr_torch.load_preset("kinova").problems["position"].seeds]
+    grr_torch.build(robot, "position", points=100, seeds=seeds).save(tmp_path / "k.grr")
+    again = grr_torch.Roadmap.load(tmp_path / "k.grr").robot
+    q = robot.sample(50, generator)
+    assert torch.equal(again.jacobian(q), robot.jacobian(q))
+    assert torch.equal(again.self_collision_distance(q), robot.self_collision_distance(q))
+    assert (again.margin, again.joint_names) == (0.01, robot.joint_names)
+    assert torch.equal(again.lower, robot.lower)
+
+
+def test_it_loads_without_the_urdf(box_arm, tmp_path):
+    robot = grr_torch.load_robot(box_arm)
+    task, bounds = grr_torch.Position(3), [(-0.5, 0.5)] * 2 + [(0.2, 0.9)]
+    grr_torch.build(robot, task, points=60, bounds=bounds, seeds=[[0.0, 1.0, 0.5]]).save(tmp_path / "b.grr")
+    box_arm.unlink()
+    assert grr_torch.Roadmap.load(tmp_path / "b.grr").robot.n == 3
+
+
+def test_the_file_names_its_tensors_and_origin(saved):
+    assert set(load_file(saved)) == set(TENSORS)
+    metadata = {name: json.loads(value) for name, value in header(saved).items()}
+    assert metadata["format_version"] == 1
+    assert metadata["package_version"] == grr_torch.__version__
+    assert metadata["robot"]["tool"] == "tool"
+    assert len(metadata["robot"]["urdf_sha256"]) == 64
+    assert metadata["quality"]["coverage"] == 1.0
+    assert metadata["parameters"]["seed"] == 0
+
+
+def test_an_untouched_file_is_verified(saved):
+    assert all(check.passed for check in verify_file(saved))
+
+
+@pytest.mark.parametrize("name", ["configurations", "connected", "points", "reachable", "wave"])
+def test_edited_tensors_are_caught(saved, name):
+    tensors, metadata = load_file(saved), header(saved)
+    vertex = int(tensors["resolved"].nonzero()[3, 0])
+    if name == "connected":
+        tensors[name][int(tensors[name].nonzero()[0, 0])] = False
+    elif name == "reachable":
+        tensors[name][vertex] ^= True
+    else:
+        tensors[name][vertex] += 1
+    save_file(tensors, saved, metadata=metadata)
+    failed = {check.name for check in verify_file(saved) if not check.passed}
+    assert "tensors" in failed
+    if name == "configurations":
+        assert {"quality", "residuals"} <= failed
+
+
+def test_an_edited_quality_is_caught(saved):
+    metadata = header(saved)
+    metadata["quality"] = metadata["quality"].replace('"smoothness": ', '"smoothness": 0')
+    edited = json.loads(header(saved)["quality"])
+    metadata["quality"] = json.dumps({**edited, "smoothness": 1.0})
+    save_file(load_file(saved), saved, metadata=metadata)
+    assert {check.name for check in verify_file(saved) if not check.passed} == {"quality"}
+
+
+def damage(saved, how):
+    tensors, metadata = load_file(saved), header(saved)
+    if how == "truncated":
+        saved.write_bytes(saved.read_bytes()[:-100])
+        return
+    if how == "text":
+        saved.write_text("hello")
+        return
+    if how == "empty":
+        saved.write_bytes(b"")
+        return
+    if how == "version":
+        metadata["format_version"] = "99"
+    elif how == "foreign":
+        metadata = {}
+    elif how == "metadata":
+        metadata["robot"] = "{"
+    elif how == "robot":
+        metadata["robot"] = json.dumps({"name": "x"})
+    elif how == "missing":
+        del tensors["wave"]
+    elif how == "short":
+        tensors["resolved"] = tensors["resolved"][:-1]
+    elif how == "dtype":
+        tensors["points"] = tensors["points"].float()
+    elif how == "edges":
+        tensors["edges"][0, 0] = 10_000
+    elif how == "nan":
+        tensors["configurations"][int(tensors["resolved"].nonzero()[0, 0])] = torch.nan
+    elif how == "columns":
+        tensors["configurations"] = tensors["configurations"][:, :3].contiguous()
+    save_file(tensors, saved, metadata=metadata)
+
+
+DAMAGES = {
+    "truncated": "truncated",
+    "text": "truncated or not a roadmap",
+    "empty": "truncated or not a roadmap",
+    "version": "format version 99; this version reads 1",
+    "foreign": "not a roadmap of grr-torch",
+    "metadata": "cannot be read",
+    "robot": "metadata that cannot be used",
+    "missing": "lacks the tensors wave",
+    "short": "'resolved' has",
+    "dtype": "'points' is torch.float32",
+    "edges": "vertices that do not exist",
+    "nan": "without a finite configuration",
+    "columns": "rows of",
+}
+
+
+@pytest.mark.parametrize("how", DAMAGES)
+def test_a_damaged_file_is_a_clear_error(saved, how):
+    damage(saved, how)
+    with pytest.raises(FileFormatError, match=DAMAGES[how]) as caught:
+        grr_torch.Roadmap.load(saved)
+    assert caught.value.path == saved
+
+
+def test_a_missing_file_is_a_clear_error(tmp_path):
+    with pytest.raises(FileFormatError, match="is not a file"):
+        grr_torch.Roadmap.load(tmp_path / "none.grr")
+
+
+def test_networkx_gets_the_resolved_part(planar_roadmap):
+    graph = planar_roadmap.to_networkx()
+    assert graph.number_of_nodes() == int(planar_roadmap.resolved.sum())
+    assert graph.number_of_edges() == int(planar_roadmap.connected.sum())
+    node = next(iter(graph.nodes))
+    np.testing.assert_array_equal(graph.nodes[node]["configuration"], planar_roadmap.configurations[node].numpy())
+    slopes = [data["configuration_distance"] / data["point_distance"] for *_, data in graph.edges(data=True)]
+    assert np.mean(slopes) == pytest.approx(planar_roadmap.quality().smoothness)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "f.txt"
+    path.write_text("old")
+    with pytest.raises(RuntimeError), atomic_write(path) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_interrupted_write_leaves_nothing(tmp_path):
+    with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "f.txt") as temporary:
+        temporary.write_text("half")
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unwritable_output_is_a_clear_error(planar_roadmap, tmp_path):
+    with pytest.raises(OutputError, match="does not exist"):
+        planar_roadmap.save(tmp_path / "none" / "f.grr")
+    with pytest.raises(OutputError, match="it is a folder"):
+        planar_roadmap.save(tmp_path)
+    assert issubclass(OutputError, GrrError)

@@ -1,0 +1,169 @@
+"""The sphere model: distances against all pairs by brute force, and the bundled Kinova against its real meshes."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+import grr_torch
+from grr_torch.errors import FileFormatError, ParameterError, UnknownNameError
+from grr_torch.robots.spheres import Sphere, SphereModel
+
+ARM_MESHES = {
+    "base_link": "Base_Link",
+    "shoulder_link": "Shoulder_Link",
+    "half_arm_1_link": "HalfArm1_Link",
+    "half_arm_2_link": "HalfArm2_Link",
+    "forearm_link": "ForeArm_Link",
+    "spherical_wrist_1_link": "SphericalWrist1_Link",
+    "spherical_wrist_2_link": "SphericalWrist2_Link",
+    "bracelet_link": "Bracelet_Link",
+}
+# lower corners of the left parts of the open gripper in end_effector_link's frame [m]; the right ones are mirrored
+GRIPPER_PARTS = {
+    "outer_knuckle": (0.0231, -0.0120, 0.0549),
+    "outer_finger": (0.0563, -0.0135, 0.0549),
+    "inner_knuckle": (0.0067, -0.0195, 0.0634),
+    "inner_finger": (0.0395, -0.0110, 0.1023),
+}
+
+
+def brute_force(robot, q):
+    """Smallest distance over every pair of spheres of every checked pair of links."""
+    poses = robot.link_poses(q)
+    smallest = torch.full(q.shape[:-1], torch.inf, dtype=q.dtype)
+    for pair in robot.spheres.checked:
+        placed = []
+        for link in pair:
+            centres = torch.tensor([sphere.center for sphere in robot.spheres.spheres[link]], dtype=q.dtype)
+            pose = poses[link]
+            placed.append(torch.einsum("...ij,sj->...si", pose[..., :3, :3], centres) + pose[..., None, :3, 3])
+        radii = [torch.tensor([sphere.radius for sphere in robot.spheres.spheres[link]], dtype=q.dtype) for link in pair]
+        gaps = torch.cdist(*placed, compute_mode="donot_use_mm_for_euclid_dist") - (radii[0][:, None] + radii[1])
+        smallest = torch.minimum(smallest, gaps.flatten(-2).amin(-1))
+    return smallest
+
+
+def test_distance_is_that_of_all_pairs(kinova, generator):
+    q = kinova.sample(3000, generator)
+    expected = brute_force(kinova, q)
+    torch.testing.assert_close(kinova.self_collision_distance(q), expected, atol=1e-12, rtol=0)
+    assert torch.equal(kinova.in_self_collision(q), expected < kinova.margin)
+    assert 0.005 < kinova.in_self_collision(q).double().mean() < 0.5
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.05, 0.2])
+def test_the_margin_is_added_to_every_check(kinova, generator, margin):
+    q = kinova.sample(500, generator)
+    robot = kinova.with_margin(margin)
+    assert torch.equal(robot.in_self_collision(q), brute_force(kinova, q) < margin)
+
+
+@pytest.mark.parametrize("margin", [-0.01, float("nan")])
+def test_a_bad_margin_is_an_error(kinova, margin):
+    with pytest.raises(ParameterError, match="margin"):
+        kinova.with_margin(margin)
+
+
+def test_distance_is_differentiable(kinova, generator):
+    q = kinova.sample(4, generator).requires_grad_()
+    assert torch.autograd.gradcheck(kinova.self_collision_distance, (q,))
+
+
+def test_a_robot_without_spheres_is_never_in_collision(planar_5, generator):
+    q = planar_5.sample(10, generator)
+    assert not bool(planar_5.in_self_collision(q).any())
+    assert bool(planar_5.self_collision_distance(q).isinf().all())
+
+
+def test_the_kinova_checks_the_pairs_that_can_touch(kinova):
+    wrists = ["spherical_wrist_1_link", "spherical_wrist_2_link", "bracelet_link", "gripper_link"]
+    expected = {frozenset(pair) for pair in itertools.product(["base_link"], wrists)}
+    expected |= {frozenset(pair) for pair in itertools.product(["shoulder_link", "half_arm_1_link"], wrists[1:])}
+    expected |= {frozenset(pair) for pair in itertools.product(["half_arm_2_link"], wrists[2:])}
+    assert {frozenset(pair) for pair in kinova.spheres.checked} == expected
+    assert kinova.margin == 0.002
+
+
+def kinova_meshes(folder, link):
+    """The real meshes of a link, in its frame."""
+    import trimesh
+
+    if link in ARM_MESHES:
+        return [trimesh.load_mesh(folder / "kinova_gen3" / f"{ARM_MESHES[link]}.off")]
+    meshes = [trimesh.load_mesh(folder / "robotiq_85" / "robotiq_85_base_link.off")]
+    for part, corner in GRIPPER_PARTS.items():
+        left = trimesh.load_mesh(folder / "robotiq_85" / f"left_{part}.off")
+        left.apply_translation(np.array(corner) - left.bounds[0])
+        right = left.copy()
+        right.apply_transform(np.diag([-1.0, -1.0, 1.0, 1.0]))
+        meshes += [left, right]
+    return meshes
+
+
+@pytest.mark.parametrize("link", [*ARM_MESHES, "gripper_link"])
+def test_the_kinova_s_spheres_hold_the_real_meshes_tightly(kinova, real_meshes, link):
+    import trimesh
+
+    meshes = kinova_meshes(real_meshes, link)
+    surface = np.vstack([np.vstack([trimesh.sample.sample_surface(m, 40_000, seed=1)[0], m.vertices]) for m in meshes])
+    spheres = kinova.spheres.spheres[link]
+    assert len(spheres) <= 20
+    centres, radii = np.array([s.center for s in spheres]), np.array([s.radius for s in spheres])
+    sticks_out = (np.linalg.norm(surface[:, None] - centres, axis=2) - radii).min(1).max()
+    assert sticks_out <= 0.001
+    unit = np.random.default_rng(0).normal(size=(1000, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    outer = (centres[:, None] + radii[:, None, None] * unit).reshape(-1, 3)
+    area = np.repeat(radii**2, len(unit))
+    free = (np.linalg.norm(outer[:, None] - centres, axis=2) - radii).min(1) > -1e-9
+    excess = cKDTree(surface).query(outer[free])[0]
+    assert np.average(excess, weights=area[free]) <= 0.012
+    assert excess.max() <= 0.030
+
+
+def test_a_model_survives_its_file(kinova, tmp_path):
+    kinova.spheres.save(tmp_path / "s.yaml", comment="two\nlines")
+    again = SphereModel.load(tmp_path / "s.yaml", kinova.urdf.links)
+    assert again == kinova.spheres
+    tiny = SphereModel({"a": (Sphere((1e-7, 1 / 3, -2e-17), 1e-5),), "b": ()}, frozenset({("a", "b")}))
+    assert SphereModel.parse(tiny.to_yaml(), ["a", "b"], source="tiny") == tiny
+
+
+def test_curobo_s_nesting_and_disabled_spheres_are_read():
+    text = """robot_cfg:
+  kinematics:
+    collision_spheres:
+      a: [{center: [0, 0, 1], radius: 0.5}, {center: [0, 0, 0], radius: -1}]
+    self_collision_ignore: {b: [a]}
+"""
+    model = SphereModel.parse(text, ["a", "b"], source="text")
+    assert model.spheres["a"] == (Sphere((0.0, 0.0, 1.0), 0.5),)
+    assert model.ignored == {("a", "b")}
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "complaint"),
+    [
+        ("a: [", FileFormatError, "is not YAML"),
+        ("a: 1", FileFormatError, "no mapping 'collision_spheres'"),
+        ("collision_spheres: {z: []}", UnknownNameError, "unknown link 'z'"),
+        ("collision_spheres: {a: [{center: [0, 0], radius: 1}]}", FileFormatError, "valid: {center"),
+        ("collision_spheres: {a: [{center: [0, 0, .nan], radius: 1}]}", FileFormatError, "not finite"),
+        ("collision_spheres: {a: []}\nself_collision_ignore: [a]", FileFormatError, "must map a link"),
+        ("collision_spheres: {a: []}\nself_collision_ignore: {a: [z]}", UnknownNameError, "unknown link 'z'"),
+        ("!!python/object/apply:os.system ['true']", FileFormatError, "is not YAML"),
+    ],
+)
+def test_a_bad_sphere_file_is_a_clear_error(text, error, complaint):
+    with pytest.raises(error, match=complaint):
+        SphereModel.parse(text, ["a", "b"], source="text")
+
+
+def test_a_missing_sphere_file_is_a_clear_error(tmp_path):
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        grr_torch.load_robot("kinova", spheres=tmp_path / "none.yaml")
