@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-
 from grr_torch.cli.show import print_json, print_rows, progress_bar, quality_rows, reports_errors
+
 from grr_torch.errors import ParameterError
 
 
@@ -27,9 +27,7 @@ def build(
     neighbours: Annotated[int | None, typer.Option(help="Nearest vertices averaged over; 24 or 64.")] = None,
     tool: Annotated[str | None, typer.Option(help="Link whose pose is controlled.")] = None,
     base: Annotated[str | None, typer.Option(help="Link in whose frame points are given.")] = None,
-    bounds: Annotated[
-        str | None, typer.Option(help="Bounds of the grid [m].", metavar="X0 X1 Y0 Y1 [Z0 Z1]")
-    ] = None,
+    bounds: Annotated[str | None, typer.Option(help="Bounds of the grid [m].", metavar="X0 X1 Y0 Y1 [Z0 Z1]")] = None,
     rotation: Annotated[
         tuple[float, float, float] | None,
         typer.Option(help="Fixed-axis roll, pitch, yaw of the tool [rad], for fixed-rotation.", metavar="R P Y"),
@@ -67,10 +65,10 @@ def build(
         )
         progress("loading the robot", 1, 1)
         out = out or Path(f"{arm.name}.grr")
+        check_writable(out)
         recording = None if no_record else record or out.with_suffix(".rrd")
-        for path in (out, recording):
-            if path is not None:
-                check_writable(path)
+        if recording is not None:
+            check_writable(recording)
         box = None if bounds is None else _bounds(bounds)
         roadmap = build_roadmap(
             arm,

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-
 from grr_torch.cli.show import print_json, print_rows, progress_bar, quality_rows, reports_errors
 
 

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import typer
-
 from grr_torch.cli.build import build
 from grr_torch.cli.info import info
 from grr_torch.cli.robots import robots
 from grr_torch.cli.spheres import spheres
 from grr_torch.cli.view import view
+
 from grr_torch.version import __version__
 
 app = typer.Typer(
@@ -35,7 +35,7 @@ def _print_version(wanted: bool) -> None:
 
 
 @app.callback()
-def _options(  # pyright: ignore[reportUnusedFunction]
+def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,

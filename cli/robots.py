@@ -6,7 +6,6 @@ from dataclasses import asdict
 from typing import Annotated, Any
 
 import typer
-
 from grr_torch.cli.show import print_json, reports_errors
 
 

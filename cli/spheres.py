@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-
 from grr_torch.cli.show import print_json, progress_bar, reports_errors
 
 
@@ -20,9 +19,7 @@ def spheres(
     tolerance: Annotated[
         float | None, typer.Option(help="As few spheres as keep within this distance of the geometry [m].")
     ] = None,
-    samples: Annotated[
-        int, typer.Option(help="Random configurations, to tell which links can touch.")
-    ] = 50_000,
+    samples: Annotated[int, typer.Option(help="Random configurations, to tell which links can touch.")] = 50_000,
     starts: Annotated[
         int, typer.Option(help="With --spheres: descents from different starts, the best is kept; 0 is quick.")
     ] = 3,
@@ -50,7 +47,9 @@ def spheres(
         by_link = {link: fit.spheres for link, fit in fits.items()}
         pairs = find_pairs(robot, by_link, samples=samples, seed=seed, progress=progress)
     model = SphereModel(by_link, frozenset(pair.links for pair in pairs if pair.ignored))
-    size = f"--tolerance {tolerance}" if tolerance is not None else f"--spheres {count or DEFAULT_COUNT} --starts {starts}"
+    size = (
+        f"--tolerance {tolerance}" if tolerance is not None else f"--spheres {count or DEFAULT_COUNT} --starts {starts}"
+    )
     model.save(out, comment=f"Made by: grr-torch spheres {urdf.name} {size} --samples {samples} --seed {seed}")
     if as_json:
         print_json(

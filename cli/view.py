@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-
 from grr_torch.cli.show import reports_errors
 
 

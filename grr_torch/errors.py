@@ -6,6 +6,7 @@ Every exception keeps these as fields, so that a program can act on them without
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -49,7 +50,7 @@ class UrdfError(GrrError):
         reason: What is wrong with it.
     """
 
-    def __init__(self, source: str | Path, reason: str) -> None:
+    def __init__(self, source: str | os.PathLike[str], reason: str) -> None:
         self.source, self.reason = str(source), reason
         super().__init__(f"{source}: {reason}")
 
@@ -106,7 +107,7 @@ class FileFormatError(GrrError):
         reason: What is wrong with it.
     """
 
-    def __init__(self, path: str | Path, reason: str) -> None:
+    def __init__(self, path: str | os.PathLike[str], reason: str) -> None:
         self.path, self.reason = Path(path), reason
         super().__init__(f"{path}: {reason}")
 
@@ -119,6 +120,6 @@ class OutputError(GrrError):
         reason: Why it was not.
     """
 
-    def __init__(self, path: str | Path, reason: str) -> None:
+    def __init__(self, path: str | os.PathLike[str], reason: str) -> None:
         self.path, self.reason = Path(path), reason
         super().__init__(f"cannot write {path}: {reason}")

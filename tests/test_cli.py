@@ -10,12 +10,12 @@ import sys
 import time
 
 import pytest
-
-import grr_torch
 from grr_torch.cli.main import join_bounds
 
+import grr_torch
+
 PROGRAM = [sys.executable, "-m", "grr_torch.cli.main"]
-QUALITY = set(grr_torch.Roadmap.quality.__annotations__) and {
+QUALITY = {
     "vertices",
     "edges",
     "resolved_vertices",
@@ -98,16 +98,35 @@ def test_robots_lists_the_bundled_ones(tmp_path):
 
 
 def test_a_robot_never_seen_before_is_built_from_its_urdf(box_arm, tmp_path):
-    (tmp_path / "seeds.csv").write_text("1.0, 0.5\n1.5, 0.2\n")
-    words = "--task position --points 80 --bounds -0.6 0.6 -0.6 0.6 0.2 1.0 --hold turn=0.5 --base base --tool tip"
+    (tmp_path / "seeds.csv").write_text("0.1, 1.0, 0.5\n2.0, 1.5, 0.2\n")
+    words = "--task position --points 80 --bounds -0.6 0.6 -0.6 0.6 0.2 1.0 --base base --tool tip"
     result = run(
-        "build", "--robot", box_arm, *words.split(), "--seeds", "seeds.csv", "--margin", "0.01", "--no-record", cwd=tmp_path
+        "build",
+        "--robot",
+        box_arm,
+        *words.split(),
+        "--seeds",
+        "seeds.csv",
+        "--margin",
+        "0.01",
+        "--no-record",
+        cwd=tmp_path,
     )
     assert result.returncode == 0, result.stderr
     roadmap = grr_torch.Roadmap.load(tmp_path / "box_arm.grr")
-    assert roadmap.robot.joint_names == ("elbow", "wrist")
+    assert roadmap.robot.joint_names == ("turn", "elbow", "wrist")
+    assert bool(roadmap.resolved.any())
     assert roadmap.robot.margin == 0.01
     assert not (tmp_path / "box_arm.rrd").exists()
+
+
+def test_joints_are_held(tmp_path):
+    (tmp_path / "seeds.txt").write_text("0.1 0.2 0.2 0.2\n")
+    words = "--robot planar_5 --hold joint_5=0.25 --points 100 --no-record --seeds seeds.txt"
+    result = run("build", *words.split(), cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    robot = grr_torch.Roadmap.load(tmp_path / "planar_5.grr").robot
+    assert (robot.n, robot.held_joints) == (4, {"joint_5": 0.25})
 
 
 def test_a_rotation_is_taken(tmp_path):
@@ -133,7 +152,7 @@ def test_spheres_are_fitted_and_used(box_arm, tmp_path):
         ("build --robot empty.urdf", "empty.urdf: is empty"),
         ("build --robot planar_5 --tool hand", "unknown link 'hand'. Known: base_link"),
         ("build --robot planar_5 --base link_9", "unknown link 'link_9'"),
-        ("build --robot planar_5 --task rotate", "unknown task of robot 'planar_5' 'rotate'. Known: position"),
+        ("build --robot planar_5 --task rotate", "Did you mean 'fixed-rotation'? Known: position"),
         ("build --robot planar_5 --points 0", "points: got 0"),
         ("build --robot planar_5 --points 99999999999", "points: got 99999999999"),
         ("build --robot planar_5 --bounds 1 -1 0 1", "low < high"),
@@ -197,13 +216,15 @@ def test_help_has_an_example(tmp_path, command):
 
 
 def test_help_imports_nothing_heavy():
-    code = "import sys, grr_torch.cli.main; print([m for m in ('torch', 'numpy', 'rerun', 'trimesh') if m in sys.modules])"
+    code = (
+        "import sys, grr_torch.cli.main; print([m for m in ('torch', 'numpy', 'rerun', 'trimesh') if m in sys.modules])"
+    )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 
 
 def test_the_numbers_after_bounds_become_one_argument():
-    assert join_bounds("build --bounds -1 1 -2e-1 .5 --points 3".split()) == [
+    assert join_bounds(["build", "--bounds", "-1", "1", "-2e-1", ".5", "--points", "3"]) == [
         "build", "--bounds=-1 1 -2e-1 .5", "--points", "3",
     ]  # fmt: skip
     assert join_bounds(["--bounds", "-1 1 0 2"]) == ["--bounds", "-1 1 0 2"]

@@ -73,7 +73,8 @@ def test_random_kinova_poses_are_reached_from_a_third_of_a_radian(kinova, genera
     assert valid.double().mean() >= 0.995
     found_position, found_rotation = kinova.forward_kinematics(solved.T[valid])
     assert (found_position - position[valid]).norm(dim=1).max() <= 1e-4
-    angle = 2.0 * torch.acos((quaternion_from_matrix(found_rotation) * quaternion_from_matrix(rotation[valid])).sum(1).abs().clamp(max=1.0))  # fmt: skip
+    cosine = (quaternion_from_matrix(found_rotation) * quaternion_from_matrix(rotation[valid])).sum(1).abs()
+    angle = 2.0 * torch.acos(cosine.clamp(max=1.0))
     assert angle.max() <= 1.1e-3
     assert bool(kinova.within_limits(solved.T[valid]).all())
     # it lands near its guess: hardly farther than the configuration that the pose came from

@@ -174,20 +174,23 @@ def test_networkx_gets_the_resolved_part(planar_roadmap):
     assert np.mean(slopes) == pytest.approx(planar_roadmap.quality().smoothness)
 
 
+def interrupt(temporary, error):
+    temporary.write_text("half")
+    raise error
+
+
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "f.txt"
     path.write_text("old")
     with pytest.raises(RuntimeError), atomic_write(path) as temporary:
-        temporary.write_text("half")
-        raise RuntimeError
+        interrupt(temporary, RuntimeError())
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_an_interrupted_write_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "f.txt") as temporary:
-        temporary.write_text("half")
-        raise KeyboardInterrupt
+        interrupt(temporary, KeyboardInterrupt())
     assert not list(tmp_path.iterdir())
 
 

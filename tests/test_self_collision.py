@@ -42,7 +42,9 @@ def brute_force(robot, q):
             centres = torch.tensor([sphere.center for sphere in robot.spheres.spheres[link]], dtype=q.dtype)
             pose = poses[link]
             placed.append(torch.einsum("...ij,sj->...si", pose[..., :3, :3], centres) + pose[..., None, :3, 3])
-        radii = [torch.tensor([sphere.radius for sphere in robot.spheres.spheres[link]], dtype=q.dtype) for link in pair]
+        radii = [
+            torch.tensor([sphere.radius for sphere in robot.spheres.spheres[link]], dtype=q.dtype) for link in pair
+        ]
         gaps = torch.cdist(*placed, compute_mode="donot_use_mm_for_euclid_dist") - (radii[0][:, None] + radii[1])
         smallest = torch.minimum(smallest, gaps.flatten(-2).amin(-1))
     return smallest

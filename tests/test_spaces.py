@@ -143,7 +143,9 @@ def test_a_space_of_poses_joins_without_a_rewrite():
     assert float(Pose(3).distance(a, b)) == pytest.approx(5.0 + 0.3 * (1.0 - cosine))
     middle = Pose(3).interpolate(a, b, 0.5)
     assert middle[0, :3].tolist() == [0.0, 1.5, 2.0]
-    torch.testing.assert_close(quaternion_distance(middle[:, 3:], a[:, 3:]), quaternion_distance(middle[:, 3:], b[:, 3:]))
+    torch.testing.assert_close(
+        quaternion_distance(middle[:, 3:], a[:, 3:]), quaternion_distance(middle[:, 3:], b[:, 3:])
+    )
 
 
 def test_tasks_survive_json():

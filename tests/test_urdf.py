@@ -134,7 +134,10 @@ def test_a_missing_mesh_is_named_with_where_it_was_sought(load, tmp_path):
         (robot_text(hinge("j", "a", "b", "fixed")), "no movable joint"),
         (robot_text(hinge("j", "a", "b", "floating")), "'floating'; supported: revolute"),
         (robot_text(hinge("j", "a", "b", "planar")), "'planar'"),
-        (robot_text(hinge("j", "a", "b", extra='<limit lower="1" upper="-1" velocity="1"/>')), "lower=1.0, upper=-1.0"),
+        (
+            robot_text(hinge("j", "a", "b", extra='<limit lower="1" upper="-1" velocity="1"/>')),
+            "lower=1.0, upper=-1.0",
+        ),
         (robot_text(hinge("j", "a", "b", extra='<limit lower="nan" upper="1" velocity="1"/>')), "lower=nan"),
         (robot_text(hinge("j", "a", "c")), "'c', which does not exist"),
         (robot_text(hinge("j", "a", "b"), links="abc"), "more than one root"),

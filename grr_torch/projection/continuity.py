@@ -31,11 +31,11 @@ def is_continuous(
     epsilon: float | None = None,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
 ) -> Tensor:
-    """Whether the straight task-space line between two points is followed without leaving the joint-space line far.
+    """Whether a straight task-space line is followed without going far from the straight joint-space line.
 
     The paper's Algorithm 1 (IsContinuous): the middle of both lines is projected; it may lie at most c · D_q from
-    either end; and so on for both halves until they are shorter than ε. Stricter than the paper's text: a middle that
-    does not converge or is in self-collision breaks the edge, and that of an edge shorter than ε is checked as well.
+    either end; and so on for both halves until they are shorter than ε. Stricter than the paper's text: a middle
+    that does not converge or collides breaks the edge, and that of an edge shorter than ε is checked as well.
 
     Args:
         robot: The robot.
@@ -83,7 +83,7 @@ def _check(
     continuous = torch.ones(len(q[0]), dtype=torch.bool, device=q[0].device)
     (pa, pb), (qa, qb) = p, q
     edge = torch.arange(len(qa), device=qa.device)
-    for depth in range(_DEPTH):
+    for _ in range(_DEPTH):
         length = distance(qa, qb, robot.continuous)
         pm = task.interpolate(pa, pb, 0.5)
         bisect = interpolate(qa, qb, 0.5, robot.continuous)

@@ -1,7 +1,7 @@
 """Projection onto self-motion manifolds: a batched Levenberg–Marquardt method.
 
-The paper's Projection(p, q_guess), with damping after Sugihara (2011), steps limited in length, and joint limits kept
-as constraints of each step: a joint that would leave its range stops at the limit, and the others make up for it.
+The paper's Projection(p, q_guess), with damping after Sugihara (2011), steps limited in length, and joint limits
+kept as constraints of each step: a joint that would leave its range stops there, and the others make up for it.
 """
 
 from __future__ import annotations

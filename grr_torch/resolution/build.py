@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import asdict
 
-
 import torch
 from torch import Tensor
 
@@ -71,9 +70,7 @@ def build(
     if reachability < 0:
         raise ParameterError("reachability", reachability, "0 or more random starts a vertex")
     begin = time.perf_counter()
-    expansion = expand(
-        robot, task, graph, seeds, neighbours=neighbours, tolerances=tolerances, progress=progress
-    )
+    expansion = expand(robot, task, graph, seeds, neighbours=neighbours, tolerances=tolerances, progress=progress)
     connected = _connected(robot, task, graph, expansion.configurations, expansion.resolved, tolerances, progress)
     seconds = time.perf_counter() - begin
     resolved = expansion.resolved.cpu()
@@ -189,5 +186,3 @@ def _connected(
         )
     progress("checking edges", len(candidates), len(candidates))
     return connected
-
-

@@ -48,8 +48,8 @@ def expand(
     """Expands seeds over a task graph.
 
     All vertices of a breadth-first layer are resolved at once (Algorithm 2, GlobalExpansion, with layers in place of
-    a queue): each is projected from the weighted, circular average of its nearest resolved vertices (Algorithm 3,
-    ProjectNeighbors, w = (max d / d)²). A vertex whose projection failed is tried again when more of the vertices
+    a queue): each is projected from the weighted, circular average of its nearest resolved vertices (Algorithm
+    3, ProjectNeighbors, w = (max d / d)²). A vertex whose projection failed is tried again when more of the vertices
     it shares an edge with are resolved.
 
     Args:

@@ -105,9 +105,7 @@ class Roadmap:
             graph.add_node(vertex, point=points[vertex], configuration=q[vertex])
         first, second = self.edges[self.connected].T
         d_p = self.task.distance(self.points[first], self.points[second]).tolist()
-        d_q = distance(
-            self.configurations[first], self.configurations[second], self.robot.continuous.cpu()
-        ).tolist()
+        d_q = distance(self.configurations[first], self.configurations[second], self.robot.continuous.cpu()).tolist()
         for a, b, p, c in zip(first.tolist(), second.tolist(), d_p, d_q, strict=True):
             graph.add_edge(a, b, point_distance=p, configuration_distance=c)
         return graph

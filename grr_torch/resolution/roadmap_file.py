@@ -75,7 +75,9 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
         raise FileFormatError(path, f"has metadata that cannot be used: {error}") from error
     widths = tensors["points"].shape[1], tensors["configurations"].shape[1]
     if widths != (task.dimension, robot.n):
-        raise FileFormatError(path, f"has rows of {widths} entries; its task and robot want {(task.dimension, robot.n)}")
+        raise FileFormatError(
+            path, f"has rows of {widths} entries; its task and robot want {(task.dimension, robot.n)}"
+        )
     return Roadmap(
         robot=robot,
         task=task,

@@ -92,7 +92,10 @@ def place_seeds(
     guesses = seeds.repeat_interleave(tried, dim=0)
     solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
     valid = valid.reshape(len(seeds), tried)
-    wrong = {"in self-collision": robot.in_self_collision(seeds), "outside joint limits": ~robot.within_limits(seeds)}
+    wrong = {
+        "in self-collision": robot.in_self_collision(seeds),
+        "outside joint limits": ~robot.within_limits(seeds),
+    }
     usable = valid.any(1) & ~torch.stack(list(wrong.values())).any(0)
     _report(usable, wrong)
     first = valid.int().argmax(1)

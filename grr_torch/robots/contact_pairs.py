@@ -73,8 +73,8 @@ def find_pairs(
     if samples < 1:
         raise ParameterError("samples", samples, "1 or more random configurations")
     joints = list(urdf.joints.values())
-    kind = {"dtype": torch.float64, "device": torch.device("cpu")}
-    tree = compile_tree(urdf, joints, urdf.root, urdf.root, {}, **kind)
+    cpu = torch.device("cpu")
+    tree = compile_tree(urdf, joints, urdf.root, urdf.root, {}, dtype=torch.float64, device=cpu)
     groups = {link: _group(urdf, link) for link in spheres}
     joined = {frozenset((_group(urdf, j.parent), _group(urdf, j.child))) for j in joints if j.movable}
     reports: list[PairReport] = []
@@ -172,7 +172,7 @@ def _bvh(urdf: Urdf, link: str) -> Any:
     import fcl
     import trimesh
 
-    mesh = trimesh.util.concatenate(link_meshes(urdf, link))
+    mesh: Any = trimesh.util.concatenate(link_meshes(urdf, link))
     model = fcl.BVHModel()
     model.beginModel(len(mesh.vertices), len(mesh.faces))
     model.addSubModel(mesh.vertices, mesh.faces)

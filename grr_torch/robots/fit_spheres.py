@@ -89,14 +89,14 @@ def fit_spheres(
     fits: dict[str, LinkFit] = {}
     for done, link in enumerate(links):
         progress("fitting spheres", done, len(links))
-        fits[link] = _fit_link(meshes[link], DEFAULT_COUNT if tolerance is None and count is None else count, tolerance, starts, seed)
+        fits[link] = _fit_link(
+            meshes[link], DEFAULT_COUNT if tolerance is None and count is None else count, tolerance, starts, seed
+        )
     progress("fitting spheres", len(links), len(links))
     return fits
 
 
-def _fit_link(
-    meshes: list[Trimesh], count: int | None, tolerance: float | None, starts: int, seed: int
-) -> LinkFit:
+def _fit_link(meshes: list[Trimesh], count: int | None, tolerance: float | None, starts: int, seed: int) -> LinkFit:
     size = float(np.linalg.norm(np.ptp(np.vstack([mesh.bounds for mesh in meshes]), axis=0)))
     solid = Solid.sampled(meshes, _spacing(size), seed)
     candidates, depths = _candidates(solid, size)
@@ -109,6 +109,8 @@ def _fit_link(
         assert chosen is not None
     else:
         chosen, tolerance = _least_tolerance(distances, depths, count, size)
+        while len(chosen) < min(count, len(candidates)):  # spheres the cover had no need of, put where there is room
+            chosen.append(int(cdist(candidates, candidates[chosen]).min(1).argmax()))
     dense = [surface_points(meshes, _spacing(size) / 2.0, seed + k) for k in (1, 2, 3)]
     covers = [(candidates[chosen], depths[chosen] + tolerance)]
     rng = np.random.default_rng(seed)
@@ -118,22 +120,18 @@ def _fit_link(
         moved = centres + rng.normal(scale=0.008 * size * start, size=centres.shape)
         covers.append(tighten(moved, radii, solid, inner, size, seed + start))
     fits = [measure(_closed(*cover, targets, dense[0], dense[1]), solid, dense[2]) for cover in covers]
-    return min(fits, key=lambda fit: fit.mean_excess + 0.25 * fit.max_excess)
+    return min(fits, key=lambda fit: fit.mean_excess + 0.1 * fit.max_excess)
 
 
-def _closed(
-    centres: Points, radii: Points, targets: Points, surface: Points, check: Points
-) -> tuple[Sphere, ...]:
+def _closed(centres: Points, radii: Points, targets: Points, surface: Points, check: Points) -> tuple[Sphere, ...]:
     """Spheres resized until no point of the geometry is outside, and rounded."""
     centres = np.round(centres, _DECIMALS)
     radii = _grown(centres, _shrunk(centres, radii, targets), surface)
     # what another sample finds outside bounds what lies between the points
-    radii = radii + 2.0 * _outside(check, centres, radii)
+    radii = radii + _outside(check, centres, radii)
     radii = np.ceil(radii * 10**_DECIMALS) / 10**_DECIMALS
     return tuple(
-        Sphere((float(x), float(y), float(z)), float(r))
-        for (x, y, z), r in zip(centres, radii, strict=True)
-        if r > 0.0
+        Sphere((float(x), float(y), float(z)), float(r)) for (x, y, z), r in zip(centres, radii, strict=True) if r > 0.0
     )
 
 
@@ -224,9 +222,7 @@ def _grown(centres: Points, radii: Points, points: Points) -> Points:
     for part in np.array_split(points, 1 + len(points) // 100_000):
         distances = cdist(part, centres)
         owner = (distances - radii).argmin(1)
-        radii = np.array(
-            [max(radii[k], distances[owner == k, k].max(initial=0.0)) for k in range(len(centres))]
-        )
+        radii = np.array([max(radii[k], distances[owner == k, k].max(initial=0.0)) for k in range(len(centres))])
     return radii
 
 

@@ -120,7 +120,7 @@ class Solid:
 
 
 def _inside(points: Points, mesh: Trimesh) -> Mask:
-    """By the planes of a convex part; else by winding number above one half, which unlike ray casting forgives small holes."""
+    """By the planes of a convex part; else by winding number above one half, which forgives small holes."""
     low, high = mesh.bounds
     inside = ((points >= low) & (points <= high)).all(1)
     if mesh.is_convex:

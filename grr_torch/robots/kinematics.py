@@ -184,7 +184,7 @@ def compile_tree(
         if dof is not None:
             raise UrdfError(urdf.name, f"joint '{joint.name}' above base '{base}' mimics a joint of the chain")
         to_base = to_base @ joint.origin @ joint_motion(joint, offset)
-    links: dict[str, tuple[int, Matrix]] = {urdf.root: (-1, np.linalg.inv(to_base))}
+    links: dict[str, tuple[int, Matrix]] = {urdf.root: (-1, np.asarray(np.linalg.inv(to_base), dtype=np.float64))}
     waiting = list(urdf.joints.values())
     while waiting:
         joint = next(joint for joint in waiting if joint.parent in links)

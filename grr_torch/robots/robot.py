@@ -232,4 +232,3 @@ class Robot:
 def _rows(columns: Tensor, q: Tensor) -> Tensor:
     """(…, N) results as (*batch, …), where q is (*batch, n)."""
     return columns.movedim(-1, 0).reshape(*q.shape[:-1], *columns.shape[:-1])
-

@@ -19,11 +19,11 @@ _COLUMNS_AT_ONCE = 4096
 
 
 class _Body(NamedTuple):
-    """The spheres of one link: rows start … start + count of its frame's points; row `start` bounds them all."""
+    """The spheres of one link: rows start … start + spheres of its frame's points; row `start` bounds them all."""
 
     frame: int
     start: int
-    count: int
+    spheres: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ class SphereKernel:
         first, second = (self.bodies[int(side)] for side in self.pairs[:, pair])
         rows_a, rows_b = _rows(first), _rows(second)
         reach = self.radii[first.frame][rows_a][:, None] + self.radii[second.frame][rows_b]
-        for chunk in columns.split(max(1, _PAIRS_AT_ONCE // (first.count * second.count))):
+        for chunk in columns.split(max(1, _PAIRS_AT_ONCE // (first.spheres * second.spheres))):
             if chunk.numel() == 0:
                 return
             a = centres[first.frame][rows_a][:, :, chunk].unbind(1)
@@ -145,7 +145,7 @@ class SphereKernel:
 
 
 def _rows(body: _Body) -> slice:
-    return slice(body.start + 1, body.start + 1 + body.count)
+    return slice(body.start + 1, body.start + 1 + body.spheres)
 
 
 def _position(bodies: Sequence[_Body], body: _Body) -> int:

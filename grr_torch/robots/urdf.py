@@ -353,4 +353,5 @@ def _shapes(parsed: Sequence[Any], link: str, source: str) -> tuple[Shape, ...]:
 def _scale(scale: Any) -> tuple[float, ...]:
     if scale is None:
         return (1.0, 1.0, 1.0)
-    return (float(scale),) * 3 if np.isscalar(scale) else tuple(map(float, scale))
+    factors = np.broadcast_to(np.asarray(scale, dtype=np.float64), 3)
+    return tuple(factors.tolist())

@@ -118,7 +118,7 @@ def staggered_grid(bounds: Bounds, n: int) -> TaskGraph:
 
 
 def random_graph(bounds: Bounds, n: int, *, k: int, generator: torch.Generator | None = None) -> TaskGraph:
-    """n points drawn uniformly within bounds, each joined to its k nearest.
+    """N points drawn uniformly within bounds, each joined to its k nearest.
 
     Args:
         bounds: (low, high) of each axis [m].
