@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -46,7 +47,7 @@ def build(
     Example: grr-torch build --robot arm.urdf --tool flange --task position --points 2000
     --bounds -0.8 0.8 -0.8 0.8 0 1.2 --seeds seeds.csv
     """
-    from grr_torch.output import check_writable
+    from grr_torch.output import atomic_write, check_writable
     from grr_torch.resolution.build import build as build_roadmap
     from grr_torch.resolution.seeds import read_seeds
     from grr_torch.robots.load import load_robot
@@ -82,12 +83,14 @@ def build(
             progress=progress,
         )
         progress("writing", 0, 2)
-        roadmap.save(out)
-        progress("writing", 1, 2)
-        if recording is not None:
-            from grr_torch.recording.roadmap import record_roadmap
+        # both files appear together, or neither does
+        with ExitStack() as stack:
+            roadmap.save(stack.enter_context(atomic_write(out)))
+            progress("writing", 1, 2)
+            if recording is not None:
+                from grr_torch.recording.roadmap import record_roadmap
 
-            record_roadmap(roadmap, recording)
+                record_roadmap(roadmap, stack.enter_context(atomic_write(recording)))
         progress("writing", 2, 2)
     quality = roadmap.quality().to_dict()
     if as_json:

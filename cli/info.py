@@ -42,9 +42,9 @@ def info(
             "tool": robot.tool,
             "base": robot.base,
             "task": metadata["task"],
-            "parameters": {**parameters, "seeds": len(roadmap.parameters["seeds"])},
+            "parameters": {**parameters, "seeds": len(roadmap.parameters.get("seeds", ()))},
             "format_version": metadata["format_version"],
-            "package_version": metadata["package_version"],
+            "package_version": metadata.get("package_version"),
         }
         if verify:
             data["verified"] = passed
@@ -64,7 +64,7 @@ def info(
                 else "none",
             ),
             *quality_rows(quality),
-            ("built in", f"{roadmap.build_seconds:.2f} s by grr-torch {metadata['package_version']}"),
+            ("built in", f"{roadmap.build_seconds:.2f} s by grr-torch {metadata.get('package_version')}"),
         ]
         print_rows(f"{file}: {robot.name}, {roadmap.task.kind}", rows)
         if checks:

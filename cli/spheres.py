@@ -37,8 +37,8 @@ def spheres(
     from grr_torch.output import check_writable
     from grr_torch.robots.contact_pairs import find_pairs
     from grr_torch.robots.fit_spheres import DEFAULT_COUNT, fit_spheres
+    from grr_torch.robots.read_urdf import read_urdf
     from grr_torch.robots.spheres import SphereModel
-    from grr_torch.robots.urdf import read_urdf
 
     check_writable(out)
     robot = read_urdf(urdf, package_dir or ())

@@ -92,6 +92,16 @@ def test_view_saves_a_recording(built, tmp_path):
     assert (tmp_path / "v.rrd").stat().st_size > 10_000
 
 
+def test_view_without_a_screen_says_so(built, tmp_path, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    if sys.platform != "linux":
+        pytest.skip("the screen is told from the environment on Linux only")
+    result = run("view", built[0] / "planar_5.grr", cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr == "error: there is no screen to open the rerun viewer on; write a file with --save F.rrd\n"
+
+
 def test_robots_lists_the_bundled_ones(tmp_path):
     assert set(json.loads(run("robots", "--json", cwd=tmp_path).stdout)) == {"kinova", "planar_3", "planar_5"}
     assert "fixed-rotation (default): 3,100 points" in run("robots", cwd=tmp_path).stdout

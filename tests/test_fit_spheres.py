@@ -11,8 +11,8 @@ from grr_torch.errors import MeshNotFoundError, ParameterError, UrdfError
 from grr_torch.robots.contact_pairs import find_pairs
 from grr_torch.robots.fit_spheres import fit_spheres
 from grr_torch.robots.geometry import Solid, link_meshes
+from grr_torch.robots.read_urdf import parse_urdf, read_urdf
 from grr_torch.robots.spheres import Sphere
-from grr_torch.robots.urdf import parse_urdf, read_urdf
 
 
 def outside(spheres, points):

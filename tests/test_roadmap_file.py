@@ -119,6 +119,10 @@ def damage(saved, how):
         metadata["robot"] = "{"
     elif how == "robot":
         metadata["robot"] = json.dumps({"name": "x"})
+    elif how == "quality":
+        metadata["quality"] = "{}"
+    elif how == "parameters":
+        del metadata["parameters"]
     elif how == "missing":
         del tensors["wave"]
     elif how == "short":
@@ -141,7 +145,9 @@ DAMAGES = {
     "version": "format version 99; this version reads 1",
     "foreign": "not a roadmap of grr-torch",
     "metadata": "cannot be read",
-    "robot": "metadata that cannot be used",
+    "robot": "metadata without .urdf_directory.",
+    "quality": "lacks the quality figures",
+    "parameters": "metadata without 'parameters'",
     "missing": "lacks the tensors wave",
     "short": "'resolved' has",
     "dtype": "'points' is torch.float32",

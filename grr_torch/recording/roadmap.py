@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
+import sys
+import sysconfig
 from typing import Any
 
 import numpy as np
@@ -47,11 +50,18 @@ def show_roadmap(roadmap: Roadmap) -> None:
     """
     import rerun as rr
 
+    # the viewer lies beside the interpreter, which need not be on the PATH
+    viewer = shutil.which("rerun", path=os.pathsep.join([sysconfig.get_path("scripts"), os.environ.get("PATH", "")]))
+    if viewer is None:
+        raise GrrError("the rerun viewer is not installed (pip install rerun-sdk); or write a file with --save F.rrd")
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise GrrError("there is no screen to open the rerun viewer on; write a file with --save F.rrd")
     recording = rr.RecordingStream("grr_torch")
     try:
-        recording.spawn(default_blueprint=_blueprint(roadmap))
+        rr.spawn(executable_path=viewer, recording=recording, default_blueprint=_blueprint(roadmap))
     except RuntimeError as error:
-        raise GrrError(f"the rerun viewer cannot be started: {error}; write a file with --save F.rrd") from error
+        reason = str(error).strip().splitlines()[0]
+        raise GrrError(f"the rerun viewer cannot be started: {reason}; write a file with --save F.rrd") from error
     with recording:
         _log(recording, roadmap)
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,14 @@ from torch import Tensor
 
 from grr_torch.errors import FileFormatError, GrrError
 from grr_torch.output import atomic_write
+from grr_torch.projection.project import Tolerances
+from grr_torch.resolution.quality import Quality
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.load import make_robot
 from grr_torch.robots.presets import load_preset, robot_names
+from grr_torch.robots.read_urdf import parse_urdf
 from grr_torch.robots.robot import Robot
 from grr_torch.robots.spheres import SphereModel
-from grr_torch.robots.urdf import parse_urdf
 from grr_torch.spaces.task import task_from_json
 from grr_torch.version import __version__
 
@@ -68,10 +71,18 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
     metadata, tensors = read_file(path)
     _check_tensors(path, tensors)
     try:
+        missing = {field.name for field in fields(Quality)} - set(metadata["quality"])
+        if missing:
+            raise FileFormatError(path, f"lacks the quality figures {', '.join(sorted(missing))}")
         robot = _robot_from_json(metadata["robot"])
         task = task_from_json(metadata["task"])
         parameters, seconds = dict(metadata["parameters"]), float(metadata["build_seconds"])
-    except (KeyError, TypeError, ValueError, GrrError) as error:
+        Tolerances(**parameters["tolerances"])
+    except FileFormatError:
+        raise
+    except KeyError as error:
+        raise FileFormatError(path, f"has metadata without {error}") from error
+    except (TypeError, ValueError, AttributeError, GrrError) as error:
         raise FileFormatError(path, f"has metadata that cannot be used: {error}") from error
     widths = tensors["points"].shape[1], tensors["configurations"].shape[1]
     if widths != (task.dimension, robot.n):

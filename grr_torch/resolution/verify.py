@@ -44,7 +44,7 @@ def verify_file(path: str | os.PathLike[str], *, progress: Progress = silent) ->
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
     robot = metadata["robot"]
     stored_hash, found_hash = str(metadata.get("tensors_sha256")), tensors_hash(tensors)
-    differing = quality_differences(metadata.get("quality", {}), quality.to_dict())
+    differing = quality_differences(metadata["quality"], quality.to_dict())
     position, rotation = quality.max_position_error or 0.0, quality.max_rotation_error or 0.0
     found = check_edges(roadmap, tolerances, progress)
     changed = int((found != roadmap.connected).sum())
@@ -52,8 +52,8 @@ def verify_file(path: str | os.PathLike[str], *, progress: Progress = silent) ->
         Check("tensors", stored_hash == found_hash, f"SHA-256 {found_hash[:12]}…, stored {stored_hash[:12]}…"),
         Check(
             "URDF",
-            hashlib.sha256(robot["urdf"].encode()).hexdigest() == robot["urdf_sha256"],
-            f"SHA-256 {robot['urdf_sha256'][:12]}…",
+            hashlib.sha256(robot["urdf"].encode()).hexdigest() == robot.get("urdf_sha256"),
+            f"SHA-256 {str(robot.get('urdf_sha256'))[:12]}…",
         ),
         Check("quality", not differing, f"differs in {', '.join(differing)}" if differing else "as stored"),
         Check(

@@ -14,9 +14,10 @@ from grr_torch.errors import ParameterError, UnknownNameError, UrdfError
 from grr_torch.robots.chain import serial_chain
 from grr_torch.robots.kinematics import compile_tree, degrees_of_freedom
 from grr_torch.robots.presets import Preset, load_preset, robot_names
+from grr_torch.robots.read_urdf import read_urdf
 from grr_torch.robots.robot import Robot
 from grr_torch.robots.spheres import SphereModel
-from grr_torch.robots.urdf import Joint, Urdf, read_urdf
+from grr_torch.robots.urdf import Joint, Urdf
 
 
 def load_robot(

@@ -1,15 +1,11 @@
-"""URDF reading: links, joints with their limits, and collision shapes, validated and in float64."""
+"""What a URDF says, validated and in float64: links, joints with their limits, shapes, and where meshes lie."""
 
 from __future__ import annotations
 
-import math
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote, urlparse
 
 import numpy as np
@@ -18,9 +14,6 @@ import numpy.typing as npt
 from grr_torch.errors import MeshNotFoundError, UnknownNameError, UrdfError
 
 Matrix = npt.NDArray[np.float64]
-
-MOVABLE_TYPES = ("revolute", "continuous", "prismatic")
-SUPPORTED_TYPES = (*MOVABLE_TYPES, "fixed")
 
 
 @dataclass(frozen=True)
@@ -168,190 +161,3 @@ class Urdf:
                 for shape in of_link:
                     if shape.filename is not None:
                         self.mesh_path(shape.filename, link)
-
-
-def read_urdf(path: str | os.PathLike[str], package_dirs: Sequence[str | os.PathLike[str]] = ()) -> Urdf:
-    """Reads and validates a URDF file.
-
-    Raises:
-        UrdfError: The file is missing, empty, malformed, or does not describe one tree of supported joints.
-    """
-    path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UrdfError(path, f"cannot be read: {error.strerror}") from error
-    return parse_urdf(data, source=str(path), directory=path.resolve().parent, package_dirs=package_dirs)
-
-
-def parse_urdf(
-    data: bytes,
-    *,
-    source: str,
-    directory: Path | None = None,
-    package_dirs: Sequence[str | os.PathLike[str]] = (),
-) -> Urdf:
-    """Validates URDF text; see `read_urdf`. `source` names it in errors."""
-    parsed = _parse(data, source)
-    links = tuple(link.name for link in parsed.links)
-    if not links:
-        raise UrdfError(source, "has no <link>")
-    _no_duplicates(source, "link", links)
-    _no_duplicates(source, "joint", [joint.name for joint in parsed.joints])
-    joints = {joint.name: _joint(joint, source) for joint in parsed.joints}
-    return Urdf(
-        name=parsed.name,
-        text=data.decode("utf-8", errors="replace"),
-        directory=directory,
-        package_dirs=tuple(Path(folder) for folder in package_dirs),
-        root=_root(links, joints, source),
-        links=links,
-        joints=joints,
-        collisions={link.name: _shapes(link.collisions, link.name, source) for link in parsed.links},
-        visuals={link.name: _shapes(link.visuals, link.name, source) for link in parsed.links},
-    )
-
-
-def _parse(data: bytes, source: str) -> Any:
-    import yourdfpy
-    from lxml import etree
-
-    if not data.strip():
-        raise UrdfError(source, "is empty")
-    try:
-        # yourdfpy falls back to a recovering parser, which would accept half a file
-        root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True))
-    except etree.XMLSyntaxError as error:
-        raise UrdfError(source, f"is not well-formed XML: {error}") from error
-    if root.tag != "robot":
-        raise UrdfError(source, f"is not a URDF: its root element is <{root.tag}>, not <robot>")
-    if "name" not in root.attrib:
-        raise UrdfError(source, "<robot> has no name")
-    try:
-        urdf = yourdfpy.URDF.load(BytesIO(data), build_scene_graph=False, load_meshes=False)
-    except (KeyError, ValueError, AttributeError, IndexError, TypeError) as error:
-        raise UrdfError(source, f"is malformed: {type(error).__name__}: {error}") from error
-    return urdf.robot
-
-
-def _no_duplicates(source: str, kind: str, names: Sequence[str]) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise UrdfError(source, f"has more than one {kind} named {', '.join(map(repr, twice))}")
-
-
-def _joint(parsed: Any, source: str) -> Joint:
-    where = f"joint '{parsed.name}'"
-    if parsed.type not in SUPPORTED_TYPES:
-        raise UrdfError(source, f"{where} is of type '{parsed.type}'; supported: {', '.join(SUPPORTED_TYPES)}")
-    origin = np.eye(4) if parsed.origin is None else np.asarray(parsed.origin, dtype=np.float64)
-    axis = np.asarray(parsed.axis, dtype=np.float64)
-    length = float(np.linalg.norm(axis))
-    if not np.isfinite(origin).all() or axis.shape != (3,) or not np.isfinite(length):
-        raise UrdfError(source, f"{where}: its origin or axis is not finite")
-    if length < 1e-9:
-        if parsed.type != "fixed":
-            raise UrdfError(source, f"{where} has an axis of length zero")
-        axis, length = np.array([1.0, 0.0, 0.0]), 1.0
-    lower, upper = _limits(parsed, where, source)
-    velocity = parsed.limit.velocity if parsed.limit is not None else None
-    if velocity is not None and not velocity >= 0.0:
-        raise UrdfError(source, f"{where} has a velocity limit of {velocity}; valid: 0 or more")
-    mimic = None
-    if parsed.mimic is not None and parsed.type != "fixed":
-        mimic = (parsed.mimic.joint, float(parsed.mimic.multiplier), float(parsed.mimic.offset))
-    return Joint(
-        name=parsed.name,
-        kind=parsed.type,
-        parent=parsed.parent,
-        child=parsed.child,
-        origin=origin,
-        axis=axis / length,
-        lower=lower,
-        upper=upper,
-        velocity=velocity if velocity else math.inf,
-        mimic=mimic,
-    )
-
-
-def _limits(parsed: Any, where: str, source: str) -> tuple[float, float]:
-    """Position limits; a limit that is not written does not exist (a parser's 0 would freeze the joint)."""
-    limit = parsed.limit
-    if parsed.type in ("continuous", "fixed") or limit is None or (limit.lower is None and limit.upper is None):
-        return -math.inf, math.inf
-    lower = 0.0 if limit.lower is None else float(limit.lower)
-    upper = 0.0 if limit.upper is None else float(limit.upper)
-    if math.isnan(lower) or math.isnan(upper) or lower > upper:
-        raise UrdfError(source, f"{where} has limits lower={lower}, upper={upper}; valid: lower ≤ upper")
-    return lower, upper
-
-
-def _root(links: Sequence[str], joints: Mapping[str, Joint], source: str) -> str:
-    """The one link without a parent; checks that joints and links make one tree."""
-    parent_of: dict[str, str] = {}
-    for joint in joints.values():
-        for link in (joint.parent, joint.child):
-            if link not in links:
-                raise UrdfError(source, f"joint '{joint.name}' names link '{link}', which does not exist")
-        if joint.child in parent_of:
-            raise UrdfError(source, f"link '{joint.child}' has more than one parent joint")
-        parent_of[joint.child] = joint.parent
-        if joint.mimic is not None and (joint.mimic[0] not in joints or not joints[joint.mimic[0]].movable):
-            raise UrdfError(source, f"joint '{joint.name}' mimics '{joint.mimic[0]}', which is no movable joint")
-    roots = [link for link in links if link not in parent_of]
-    if len(roots) > 1:
-        raise UrdfError(source, f"has more than one root link: {', '.join(roots)}")
-    if not roots or any(_depth(link, parent_of) < 0 for link in links):
-        raise UrdfError(source, "its joints form a loop")
-    for joint in joints.values():
-        _mimic_source(joint, joints, source)
-    return roots[0]
-
-
-def _depth(link: str, parent_of: Mapping[str, str]) -> int:
-    depth = 0
-    while link in parent_of:
-        link, depth = parent_of[link], depth + 1
-        if depth > len(parent_of):
-            return -1
-    return depth
-
-
-def _mimic_source(joint: Joint, joints: Mapping[str, Joint], source: str) -> None:
-    seen = {joint.name}
-    while joint.mimic is not None:
-        joint = joints[joint.mimic[0]]
-        if joint.name in seen:
-            raise UrdfError(source, f"joint '{joint.name}' mimics itself")
-        seen.add(joint.name)
-
-
-def _shapes(parsed: Sequence[Any], link: str, source: str) -> tuple[Shape, ...]:
-    shapes: list[Shape] = []
-    for item in parsed:
-        geometry = item.geometry
-        if geometry is None:
-            raise UrdfError(source, f"link '{link}' has a shape without <geometry>")
-        if geometry.box is not None:
-            kind, size = "box", tuple(map(float, geometry.box.size))
-        elif geometry.cylinder is not None:
-            kind, size = "cylinder", (geometry.cylinder.radius, geometry.cylinder.length)
-        elif geometry.sphere is not None:
-            kind, size = "sphere", (geometry.sphere.radius,)
-        else:
-            kind, size = "mesh", _scale(geometry.mesh.scale)
-            if not geometry.mesh.filename:
-                raise UrdfError(source, f"link '{link}' has a <mesh> without a filename")
-        if not all(math.isfinite(value) and (value > 0.0 or kind == "mesh") for value in size):
-            raise UrdfError(source, f"link '{link}' has a {kind} of size {size}; valid: positive and finite")
-        origin = np.eye(4) if item.origin is None else np.asarray(item.origin, dtype=np.float64)
-        filename = geometry.mesh.filename if kind == "mesh" else None
-        shapes.append(Shape(kind, origin, size, filename))
-    return tuple(shapes)
-
-
-def _scale(scale: Any) -> tuple[float, ...]:
-    if scale is None:
-        return (1.0, 1.0, 1.0)
-    factors = np.broadcast_to(np.asarray(scale, dtype=np.float64), 3)
-    return tuple(factors.tolist())
