@@ -24,19 +24,21 @@ def build(
     reachability: Annotated[
         int, typer.Option(help="Random starts per unresolved vertex, to tell which are reachable; 0: not measured.")
     ] = 0,
-    seed: Annotated[int, typer.Option(help="Of all random draws.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
     neighbours: Annotated[int | None, typer.Option(help="Nearest vertices averaged over; 24 or 64.")] = None,
     tool: Annotated[str | None, typer.Option(help="Link whose pose is controlled.")] = None,
     base: Annotated[str | None, typer.Option(help="Link in whose frame points are given.")] = None,
-    bounds: Annotated[str | None, typer.Option(help="Bounds of the grid [m].", metavar="X0 X1 Y0 Y1 [Z0 Z1]")] = None,
+    bounds: Annotated[
+        str | None, typer.Option(help="Bounds of the grid, in metres.", metavar="X0 X1 Y0 Y1 [Z0 Z1]")
+    ] = None,
     rotation: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Fixed-axis roll, pitch, yaw of the tool [rad], for fixed-rotation.", metavar="R P Y"),
+        typer.Option(help="Fixed-axis roll, pitch, yaw of the tool in radians, for fixed-rotation.", metavar="R P Y"),
     ] = None,
     package_dir: Annotated[list[Path] | None, typer.Option(help="Folder for package:// meshes; repeatable.")] = None,
     hold: Annotated[list[str] | None, typer.Option(help="Hold a joint still; repeatable.", metavar="J=VALUE")] = None,
     spheres: Annotated[Path | None, typer.Option(help="Sphere file for self-collision (grr-torch spheres).")] = None,
-    margin: Annotated[float | None, typer.Option(help="Added to every self-collision check [m].")] = None,
+    margin: Annotated[float | None, typer.Option(help="Added to every self-collision check, in metres.")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
 ) -> None:
@@ -70,6 +72,8 @@ def build(
         recording = None if no_record else record or out.with_suffix(".rrd")
         if recording is not None:
             check_writable(recording)
+            if recording.resolve() == out.resolve():
+                raise ParameterError("--record", recording, f"another file than the roadmap's, {out}")
         box = None if bounds is None else _bounds(bounds)
         roadmap = build_roadmap(
             arm,

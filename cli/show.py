@@ -72,12 +72,13 @@ def print_rows(title: str, rows: list[tuple[str, str]]) -> None:
     """A table of names and values on standard output."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(title=title, title_justify="left", show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
     for name, value in rows:
-        table.add_row(name, value)
+        table.add_row(Text(name), Text(value))
     Console().print(table)
 
 
@@ -112,6 +113,6 @@ def quality_rows(quality: dict[str, Any]) -> list[tuple[str, str]]:
             "smallest self-collision distance",
             number("min_self_collision_distance", "m", ".4f").replace("none", "not checked: no sphere model"),
         ),
-        ("self-collisions", str(quality["self_collisions"])),
+        ("self-collisions", "not checked" if quality["self_collisions"] is None else str(quality["self_collisions"])),
         ("joint limit violations", str(quality["joint_limit_violations"])),
     ]

@@ -17,13 +17,13 @@ def spheres(
         int | None, typer.Option("--spheres", help="At most so many spheres a link; 16 if no --tolerance.")
     ] = None,
     tolerance: Annotated[
-        float | None, typer.Option(help="As few spheres as keep within this distance of the geometry [m].")
+        float | None, typer.Option(help="As few spheres as keep within this distance of the geometry, in metres.")
     ] = None,
-    samples: Annotated[int, typer.Option(help="Random configurations, to tell which links can touch.")] = 50_000,
+    samples: Annotated[int, typer.Option(min=1, help="Random configurations, to tell which links can touch.")] = 50_000,
     starts: Annotated[
         int, typer.Option(help="With --spheres: descents from different starts, the best is kept; 0 is quick.")
     ] = 3,
-    seed: Annotated[int, typer.Option(help="Of all random draws.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
     package_dir: Annotated[list[Path] | None, typer.Option(help="Folder for package:// meshes; repeatable.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:

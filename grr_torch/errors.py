@@ -87,6 +87,17 @@ class ParameterError(GrrError, ValueError):
         super().__init__(f"{name}: got {value}; valid: {valid}")
 
 
+def check_seed(seed: int) -> int:
+    """The seed of a random generator.
+
+    Raises:
+        ParameterError: It is no whole number from 0 to 2⁶³ − 1.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 1 << 63:
+        raise ParameterError("seed", seed, "a whole number from 0 to 2⁶³ − 1")
+    return seed
+
+
 class SeedError(GrrError):
     """Seeds of which none can start a roadmap.
 

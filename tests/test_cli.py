@@ -182,6 +182,8 @@ def test_spheres_are_fitted_and_used(box_arm, tmp_path):
         ("build --robot planar_5 --task position --rotation 0 0 1", "none for the task 'position'"),
         ("build --robot kinova --spheres words.csv", "is not a sphere file"),
         ("build --robot planar_5 --reachability -3", "reachability: got -3"),
+        ("build --robot planar_5 --out x.rrd", "another file than the roadmap's"),
+        ("build --robot planar_5 --seed -1", "Invalid value for '--seed'"),
         ("info none.grr", "none.grr: is not a file"),
         ("info words.csv", "truncated or not a roadmap"),
         ("view words.csv --save x.rrd", "truncated or not a roadmap"),

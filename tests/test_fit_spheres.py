@@ -9,7 +9,7 @@ from random_robots import BOX_ARM
 
 from grr_torch.errors import MeshNotFoundError, ParameterError, UrdfError
 from grr_torch.robots.contact_pairs import find_pairs
-from grr_torch.robots.fit_spheres import fit_spheres
+from grr_torch.robots.fit_spheres import fit_spheres, measure
 from grr_torch.robots.geometry import Solid, link_meshes
 from grr_torch.robots.read_urdf import parse_urdf, read_urdf
 from grr_torch.robots.spheres import Sphere
@@ -33,6 +33,12 @@ def test_every_point_of_the_geometry_is_inside_a_sphere(fits):
             points = np.vstack([trimesh.sample.sample_surface(mesh, 20_000, seed=9)[0], mesh.vertices])
             assert outside(fit.spheres, points) <= 1e-5
         assert fit.uncovered <= 1e-5
+
+
+def test_what_is_left_outside_is_told():
+    mesh = trimesh.creation.box((0.1, 0.1, 0.3))
+    fit = measure((Sphere((0.0, 0.0, 0.0), 0.01),), Solid.sampled([mesh], 0.01, 0), mesh.vertices)
+    assert fit.uncovered == pytest.approx(np.linalg.norm([0.05, 0.05, 0.15]) - 0.01)
 
 
 def test_a_sphere_is_fitted_by_a_sphere(fits):
@@ -108,7 +114,16 @@ def test_links_that_always_touch_are_ignored():
 
 
 @pytest.mark.parametrize(
-    "options", [{"count": 0}, {"tolerance": 0.0}, {"tolerance": -1.0}, {"count": 3, "tolerance": 0.01}]
+    "options",
+    [
+        {"tolerance": 1e-4},
+        {"seed": -1},
+        {"starts": -1},
+        {"count": 0},
+        {"tolerance": 0.0},
+        {"tolerance": -1.0},
+        {"count": 3, "tolerance": 0.01},
+    ],
 )
 def test_bad_options_are_errors(options):
     with pytest.raises(ParameterError):

@@ -51,6 +51,13 @@ def test_the_robot_comes_back_whole(kinova, tmp_path, generator):
     assert torch.equal(again.lower, robot.lower)
 
 
+def test_a_float32_roadmap_is_verified_as_such(tmp_path):
+    robot = grr_torch.load_robot("planar_5", dtype=torch.float32)
+    grr_torch.build(robot, "position", points=60).save(tmp_path / "f.grr")
+    assert grr_torch.Roadmap.load(tmp_path / "f.grr").robot.dtype == torch.float32
+    assert all(check.passed for check in verify_file(tmp_path / "f.grr"))
+
+
 def test_it_loads_without_the_urdf(box_arm, tmp_path):
     robot = grr_torch.load_robot(box_arm)
     task, bounds = grr_torch.Position(3), [(-0.5, 0.5)] * 2 + [(0.2, 0.9)]
@@ -81,7 +88,7 @@ def test_edited_tensors_are_caught(saved, name):
     if name == "connected":
         tensors[name][int(tensors[name].nonzero()[0, 0])] = False
     elif name == "reachable":
-        tensors[name][vertex] ^= True
+        tensors[name][int((~tensors[name]).nonzero()[0, 0])] = True
     else:
         tensors[name][vertex] += 1
     save_file(tensors, saved, metadata=metadata)

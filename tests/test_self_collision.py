@@ -76,6 +76,13 @@ def test_distance_is_differentiable(kinova, generator):
     assert torch.autograd.gradcheck(kinova.self_collision_distance, (q,))
 
 
+def test_what_is_not_a_number_is_not_free(kinova):
+    q = torch.zeros(3, 7, dtype=torch.float64)
+    q[1, 2] = torch.nan
+    assert kinova.in_self_collision(q).tolist() == [False, True, False]
+    assert kinova.self_collision_distance(q).isnan().tolist() == [False, True, False]
+
+
 def test_a_robot_without_spheres_is_never_in_collision(planar_5, generator):
     q = planar_5.sample(10, generator)
     assert not bool(planar_5.in_self_collision(q).any())

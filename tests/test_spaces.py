@@ -223,7 +223,33 @@ def test_adjacency_lists_both_directions():
 
 
 @pytest.mark.parametrize(
-    "bounds", [[(1, -1), (0, 1)], [(0, 0), (0, 1)], [(0, math.nan), (0, 1)], [(0, math.inf), (0, 1)], [(0, 1)], []]
+    ("points", "edges"),
+    [
+        (torch.zeros(0, 2, dtype=torch.float64), torch.empty(0, 2, dtype=torch.long)),
+        (torch.zeros(1, 2), torch.empty(0, 2, dtype=torch.long)),
+        (torch.tensor([[0.0, torch.nan]], dtype=torch.float64), torch.empty(0, 2, dtype=torch.long)),
+        (torch.zeros(2, 2, dtype=torch.float64), torch.empty(0, 2, dtype=torch.long)),
+        (torch.eye(2, dtype=torch.float64), torch.tensor([[0, 2]])),
+        (torch.eye(2, dtype=torch.float64), torch.tensor([0, 1])),
+    ],
+)
+def test_a_bad_graph_is_an_error(points, edges):
+    with pytest.raises(ParameterError, match="of a graph"):
+        TaskGraph(points, edges)
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        [0, 1, 0, 1],
+        [(0, 1, 2), (0, 1)],
+        [(1, -1), (0, 1)],
+        [(0, 0), (0, 1)],
+        [(0, math.nan), (0, 1)],
+        [(0, math.inf), (0, 1)],
+        [(0, 1)],
+        [],
+    ],
 )
 def test_bad_bounds_are_errors(bounds):
     with pytest.raises(ParameterError, match="low < high"):

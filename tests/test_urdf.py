@@ -10,7 +10,8 @@ import trimesh
 from random_robots import BOX_ARM
 
 import grr_torch
-from grr_torch.errors import MeshNotFoundError, ParameterError, UnknownNameError, UrdfError
+from grr_torch.errors import GrrWarning, MeshNotFoundError, ParameterError, UnknownNameError, UrdfError
+from grr_torch.spaces.configuration import normalise
 
 HINGE = '<joint name="{n}" type="{t}"><parent link="{p}"/><child link="{c}"/><axis xyz="0 0 1"/>{x}</joint>'
 
@@ -83,6 +84,36 @@ def test_a_mimic_joint_follows_and_narrows_the_limits(load):
     assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.1 + 0.7)
 
 
+@pytest.mark.parametrize(("multiplier", "continuous"), [("2", True), ("-1", True), ("0.5", False)])
+def test_a_joint_that_others_follow_wraps_only_by_whole_turns(load, multiplier, continuous):
+    mimic = f'<mimic joint="i" multiplier="{multiplier}"/>'
+    text = robot_text(hinge("i", "a", "b", "continuous", ""), hinge("j", "b", "c", "continuous", mimic), links="abc")
+    robot = load(text)
+    assert robot.continuous.item() is continuous
+    q = torch.tensor([[3.3], [-4.0], [9.0]], dtype=torch.float64)
+    turned = robot.forward_kinematics(normalise(q, robot.continuous))
+    torch.testing.assert_close(turned, robot.forward_kinematics(q), atol=1e-12, rtol=0)
+
+
+def test_limits_of_joints_beside_the_chain_hold_for_the_one_they_follow(load):
+    mimic = '<limit lower="-0.2" upper="0.4" velocity="9"/><mimic joint="i" multiplier="-0.5"/>'
+    robot = load(robot_text(hinge("i", "a", "b"), hinge("side", "a", "c", extra=mimic), links="abc"), tool="b")
+    assert (robot.lower.item(), robot.upper.item()) == pytest.approx((-0.8, 0.4))
+
+
+def test_text_in_another_encoding_is_read(tmp_path):
+    path = tmp_path / "utf16.urdf"
+    path.write_bytes(('<?xml version="1.0" encoding="UTF-16"?>' + robot_text(hinge("jé", "a", "b"))).encode("utf-16"))
+    robot = grr_torch.load_robot(path)
+    assert robot.joint_names == ("jé",)
+    assert "encoding" not in robot.urdf.text
+
+
+def test_a_margin_without_spheres_is_warned_of(load):
+    with pytest.warns(GrrWarning, match="the margin has no effect"):
+        load(robot_text(hinge("j", "a", "b")), margin=0.01)
+
+
 def test_base_may_lie_inside_the_tree(load):
     text = robot_text(hinge("i", "a", "b"), hinge("j", "b", "c"), links="abc")
     robot = load(text, base="b", held_joints={"i": 0.3})
@@ -146,8 +177,18 @@ def test_a_missing_mesh_is_named_with_where_it_was_sought(load, tmp_path):
         (robot_text(hinge("j", "a", "b", extra='<mimic joint="x"/>')), "mimics 'x'"),
         (robot_text(hinge("j", "a", "b").replace("0 0 1", "0 0 0")), "axis of length zero"),
         (robot_text(hinge("j", "a", "b").replace("0 0 1", "0 0 nan")), "not finite"),
-        (BOX_ARM.replace('radius="0.05" length', 'radius="-1" length'), "valid: positive"),
+        (BOX_ARM.replace('radius="0.05" length', 'radius="-1" length'), "2 finite values, positive"),
         (BOX_ARM.replace("<sphere", "<capsule"), "malformed"),
+        (BOX_ARM.replace('size="0.2 0.2 0.1"', 'size="0.2 0.2"'), "valid: 3 finite values"),
+        (BOX_ARM.replace('<sphere radius="0.05"/>', '<mesh filename="m.stl" scale="1 2"/>'), "valid: 3 finite values"),
+        (BOX_ARM.replace('xyz="0 0 0.05"', 'xyz="0 0 nan"'), "origin is not finite"),
+        (robot_text(hinge("j", "a", "b", extra='<limit lower="inf" upper="inf" velocity="1"/>')), "lower=inf"),
+        (
+            robot_text(
+                hinge("i", "a", "b"), hinge("j", "b", "c", extra='<mimic joint="i" multiplier="nan"/>'), links="abc"
+            ),
+            "valid: finite",
+        ),
     ],
 )
 def test_a_bad_urdf_is_a_clear_error(load, text, complaint):

@@ -75,7 +75,7 @@ def project(
         check_collision: Whether a configuration in self-collision is invalid.
 
     Returns:
-        Configurations (*batch, n), continuous joints in [−π, π), and valid (*batch,): converged, within limits and
+        Configurations (*batch, n), continuous joints in [−π, π], and valid (*batch,): converged, within limits and
         free of self-collision. Rows that are not valid are NaN.
 
     Raises:
@@ -97,8 +97,8 @@ def point_columns(robot: Robot, task: TaskSpace, points: Tensor) -> Tensor:
     Raises:
         ParameterError: The width is not the task's, or a value is not finite.
     """
-    if points.ndim == 0 or points.shape[-1] != task.dimension:
-        raise ParameterError("point shape", tuple(points.shape), f"(*batch, {task.dimension})")
+    if points.ndim == 0 or points.shape[-1] != task.width:
+        raise ParameterError("point shape", tuple(points.shape), f"(*batch, {task.width})")
     columns = points.to(device=robot.device, dtype=robot.dtype).reshape(-1, points.shape[-1]).T.contiguous()
     if not bool(columns.isfinite().all()):
         raise ParameterError("points", "NaN or infinite values", "finite values")

@@ -173,7 +173,7 @@ def _blueprint(roadmap: Roadmap) -> Any:
             origin="/",
             contents=["+ /robot/**", *contents],
             name=name,
-            spatial_information=rrb.SpatialInformation(target_frame=roadmap.robot.urdf.root, show_axes=False),
+            spatial_information=rrb.SpatialInformation(target_frame=roadmap.robot.base, show_axes=False),
             eye_controls=_camera(roadmap),
             line_grid=False,
             background=(18, 20, 26),

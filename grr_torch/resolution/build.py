@@ -8,7 +8,7 @@ from dataclasses import asdict
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError, SeedError, UnknownNameError
+from grr_torch.errors import ParameterError, SeedError, UnknownNameError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
@@ -67,6 +67,7 @@ def build(
         centre, radius = reach(robot)
         place = ", ".join(f"{value:.3f}" for value in centre.tolist())
         raise ParameterError("bounds", "no point within reach", f"points within {radius:.3f} m of ({place})")
+    check_seed(seed)
     if reachability < 0:
         raise ParameterError("reachability", reachability, "0 or more random starts a vertex")
     begin = time.perf_counter()
@@ -100,6 +101,9 @@ def build(
             "method": "expansion",
             "neighbours": default_neighbours(task) if neighbours is None else neighbours,
             "seeds": torch.as_tensor(seeds, dtype=torch.float64).tolist(),
+            "points": len(graph.points),
+            "bounds": torch.stack([graph.points.amin(0), graph.points.amax(0)], dim=1).tolist(),
+            "margin": robot.margin,
             "seed": seed,
             "reachability": reachability,
             "tolerances": asdict(tolerances),
@@ -116,7 +120,7 @@ def check_task(robot: Robot, task: TaskSpace) -> None:
     """
     if task.dimension == 2 and task.constraints > 2:
         _, rotation = robot.forward_kinematics(robot.sample(64, torch.Generator().manual_seed(0)))
-        if not bool(((rotation[:, 2, 2] - 1.0).abs() < 1e-9).all()):
+        if not bool(((rotation[:, 2, 2].abs() - 1.0).abs() < 1e-5).all()):
             raise ParameterError(
                 "task", f"{task.kind} in {task.name}", f"SE(3) for {robot.name}, whose tool leaves the plane"
             )
@@ -150,8 +154,8 @@ def _problem(
         if kind is None:
             raise ParameterError("task", "not given", "'position' or 'fixed-rotation'")
         task = make_task(kind, graph.points.shape[1], problem.rotation if problem else None)
-    if graph.points.shape[1] != task.dimension:
-        raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.dimension} for {task.name}")
+    if graph.points.shape[1] != task.width:
+        raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.width} for {task.name}")
     return task, graph, seeds
 
 

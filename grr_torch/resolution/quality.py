@@ -36,7 +36,7 @@ class Quality:
         max_position_error: Largest distance of a tool from its point [m].
         max_rotation_error: Largest angle of a tool from its rotation [rad]; 0 where rotation is free.
         min_self_collision_distance: Smallest distance of two links [m]; None without a sphere model.
-        self_collisions: Resolved vertices nearer to self-collision than the margin.
+        self_collisions: Resolved vertices nearer to self-collision than the margin; None without a sphere model.
         joint_limit_violations: Resolved vertices with a joint outside its limits.
     """
 
@@ -57,7 +57,7 @@ class Quality:
     max_position_error: float | None
     max_rotation_error: float | None
     min_self_collision_distance: float | None
-    self_collisions: int
+    self_collisions: int | None
     joint_limit_violations: int
 
     def to_dict(self) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def measure_quality(roadmap: Roadmap) -> Quality:
         max_position_error=_largest(position_error),
         max_rotation_error=_largest(rotation_error),
         min_self_collision_distance=_clearance(roadmap, q),
-        self_collisions=int(roadmap.robot.in_self_collision(q).sum()),
+        self_collisions=int(roadmap.robot.in_self_collision(q).sum()) if roadmap.robot.spheres else None,
         joint_limit_violations=int((~roadmap.robot.within_limits(q.to(roadmap.robot.lower))).sum()),
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import ParameterError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, project_columns
 from grr_torch.robots.robot import Robot
@@ -41,7 +41,7 @@ def measure_reachability(
     """
     if attempts < 1:
         raise ParameterError("reachability", attempts, "1 or more random starts a vertex")
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(check_seed(seed))
     reached = torch.zeros(len(points), dtype=torch.bool)
     left = within_reach(robot, task, points).nonzero()[:, 0]
     for done in range(0, attempts, _ROUND):

@@ -27,7 +27,7 @@ class Roadmap:
         robot: The robot.
         task: The task space.
         points: (V, width) points of the task space [m].
-        configurations: (V, n) configurations [rad or m], NaN where unresolved; continuous joints in [−π, π).
+        configurations: (V, n) configurations [rad or m], NaN where unresolved; continuous joints in [−π, π].
         resolved: (V,) bool, vertices that have a configuration.
         edges: (E, 2) vertex indices of the task graph's edges.
         connected: (E,) bool, edges that passed the continuity check.

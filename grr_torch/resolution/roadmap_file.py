@@ -74,6 +74,8 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
         missing = {field.name for field in fields(Quality)} - set(metadata["quality"])
         if missing:
             raise FileFormatError(path, f"lacks the quality figures {', '.join(sorted(missing))}")
+        if not all(value is None or isinstance(value, int | float) for value in metadata["quality"].values()):
+            raise FileFormatError(path, "has quality figures that are not numbers")
         robot = _robot_from_json(metadata["robot"])
         task = task_from_json(metadata["task"])
         parameters, seconds = dict(metadata["parameters"]), float(metadata["build_seconds"])
@@ -85,10 +87,8 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
     except (TypeError, ValueError, AttributeError, GrrError) as error:
         raise FileFormatError(path, f"has metadata that cannot be used: {error}") from error
     widths = tensors["points"].shape[1], tensors["configurations"].shape[1]
-    if widths != (task.dimension, robot.n):
-        raise FileFormatError(
-            path, f"has rows of {widths} entries; its task and robot want {(task.dimension, robot.n)}"
-        )
+    if widths != (task.width, robot.n):
+        raise FileFormatError(path, f"has rows of {widths} entries; its task and robot want {(task.width, robot.n)}")
     return Roadmap(
         robot=robot,
         task=task,
@@ -115,7 +115,7 @@ def read_file(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, T
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
-            if json.loads(header.get("format", "null")) != FORMAT:
+            if header.get("format") != json.dumps(FORMAT):
                 raise FileFormatError(path, "is not a roadmap of grr-torch")
             version = json.loads(header.get("format_version", "null"))
             if version != FORMAT_VERSION:
@@ -151,6 +151,7 @@ def _robot_to_json(robot: Robot) -> dict[str, Any]:
         "held_joints": dict(robot.held_joints),
         "spheres": robot.spheres.to_yaml() if robot.spheres else None,
         "margin": robot.margin,
+        "dtype": str(robot.dtype).removeprefix("torch."),
     }
 
 
@@ -174,7 +175,7 @@ def _robot_from_json(data: dict[str, Any]) -> Robot:
         spheres=None if spheres is None else SphereModel.parse(spheres, urdf.links, source=data["name"]),
         margin=float(data["margin"]),
         device=torch.device("cpu"),
-        dtype=torch.float64,
+        dtype=torch.float32 if data["dtype"] == "float32" else torch.float64,
     )
 
 
@@ -194,9 +195,10 @@ def _check_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) 
     for name, tensor in tensors.items():
         demand(name in _DTYPES, f"has an unknown tensor '{name}'")
         demand(tensor.dtype == _DTYPES[name], f"tensor '{name}' is {tensor.dtype}, not {_DTYPES[name]}")
+    for name, tensor in tensors.items():
+        axes = 2 if name in ("points", "configurations", "edges") else 1
+        demand(tensor.ndim == axes, f"tensor '{name}' has {tensor.ndim} axes, not {axes}")
     vertices, count = len(tensors["points"]), len(tensors["edges"])
-    for name in ("points", "configurations", "edges"):
-        demand(tensors[name].ndim == 2, f"tensor '{name}' is not a table")
     lengths = {"configurations": vertices, "resolved": vertices, "wave": vertices, "connected": count}
     lengths |= {"reachable": vertices} if "reachable" in tensors else {}
     for name, length in lengths.items():
@@ -207,4 +209,6 @@ def _check_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) 
     demand(bool(tensors["points"].isfinite().all()), "has points that are not finite")
     finite = tensors["configurations"].isfinite().all(1)
     demand(bool((finite == resolved).all()), "has resolved vertices without a finite configuration, or the reverse")
+    demand(bool((tensors["wave"] >= 0).eq(resolved).all()), "has waves that do not fit what is resolved")
+    demand(not bool((resolved & ~tensors.get("reachable", resolved)).any()), "has resolved vertices not reachable")
     demand(bool(resolved[edges[tensors["connected"]]].all()), "has connected edges to unresolved vertices")

@@ -88,7 +88,7 @@ def place_seeds(
     position, _ = robot.forward_kinematics(seeds)
     nearest = graph.nearest(position[:, : task.dimension], _TRIED)
     tried = nearest.shape[1]
-    targets = graph.points[nearest].to(seeds).reshape(-1, task.dimension)
+    targets = graph.points[nearest].to(seeds).reshape(-1, task.width)
     guesses = seeds.repeat_interleave(tried, dim=0)
     solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
     valid = valid.reshape(len(seeds), tried)

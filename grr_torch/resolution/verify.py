@@ -62,6 +62,10 @@ def verify_file(path: str | os.PathLike[str], *, progress: Progress = silent) ->
             f"at most {position:.2e} m and {rotation:.2e} rad",
         ),
         Check("joint limits", not quality.joint_limit_violations, f"{quality.joint_limit_violations} violations"),
-        Check("self-collision", not quality.self_collisions, f"{quality.self_collisions} collisions"),
+        Check(
+            "self-collision",
+            not quality.self_collisions,
+            "no sphere model" if quality.self_collisions is None else f"{quality.self_collisions} collisions",
+        ),
         Check("edges", changed == 0, f"{changed} of {len(found)} judged otherwise"),
     ]

@@ -19,7 +19,7 @@ from grr_torch.progress import Progress, silent
 from grr_torch.robots.geometry import Points, link_meshes
 from grr_torch.robots.kinematics import KinematicTree, compile_tree, degrees_of_freedom
 from grr_torch.robots.spheres import Sphere, ordered_pair
-from grr_torch.robots.urdf import Urdf
+from grr_torch.robots.urdf import Urdf, sampling_range
 
 # links that touch in more than this share of configurations do so by construction
 _ALWAYS = 0.95
@@ -56,8 +56,8 @@ def find_pairs(
 ) -> list[PairReport]:
     """Sorts all pairs of links that have spheres into those to check and those to ignore.
 
-    Every movable joint of the URDF takes part. Contact is that of the triangles of the collision geometry; the
-    spheres, which hold the geometry, only tell where it cannot be.
+    Every movable joint of the URDF takes part. Contact is that of the triangles of the collision geometry: a link
+    wholly inside another one is not seen. The spheres, which hold the geometry, only tell where contact cannot be.
 
     Args:
         urdf: The robot.
@@ -152,10 +152,10 @@ def _distances(first: Points, second: Points) -> Points:
 def _random_poses(
     urdf: Urdf, tree: KinematicTree, links: list[str], count: int, generator: torch.Generator
 ) -> dict[str, Points]:
-    """Poses (count, 4, 4) of links in random configurations of all joints, within limits or ±π."""
+    """Poses (count, 4, 4) of links in random configurations of all joints."""
     free = degrees_of_freedom(list(urdf.joints.values()), {})
-    low = torch.tensor([max(joint.lower, -np.pi) for joint in free], dtype=torch.float64)
-    high = torch.tensor([min(joint.upper, np.pi) for joint in free], dtype=torch.float64)
+    ranges = [sampling_range(joint.kind, joint.lower, joint.upper) for joint in free]
+    low, high = torch.tensor(ranges, dtype=torch.float64).reshape(-1, 2).T
     q = low + (high - low) * torch.rand(count, len(free), dtype=torch.float64, generator=generator)
     frames = tree.frames(q.T.contiguous())
     poses: dict[str, Points] = {}

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.distance import cdist
 
-from grr_torch.errors import ParameterError, UrdfError
+from grr_torch.errors import ParameterError, UrdfError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.robots.geometry import Mask, Points, Solid, link_meshes, surface_points
 from grr_torch.robots.spheres import Sphere
@@ -80,6 +80,7 @@ def fit_spheres(
         raise ParameterError("spheres", count, "1 to 1000 a link")
     if tolerance is not None and not 1e-4 <= tolerance < np.inf:
         raise ParameterError("tolerance", tolerance, "0.0001 m or more")
+    check_seed(seed)
     if starts < 0:
         raise ParameterError("starts", starts, "0 or more")
     links = [link for link, shapes in urdf.collisions.items() if shapes]
@@ -104,9 +105,11 @@ def _fit_link(meshes: list[Trimesh], count: int | None, tolerance: float | None,
     targets = np.vstack([solid.boundary[_thinned(solid.boundary, 4000)], inner])
     distances = cdist(candidates, targets)
     if count is None:
-        assert tolerance is not None
-        chosen, starts = _cover(distances, depths + tolerance, len(targets)), 0
-        assert chosen is not None
+        tolerance, starts = tolerance or 0.0, 0
+        chosen = _cover(distances, depths + tolerance, len(targets))
+        if chosen is None:
+            least = float((distances - depths[:, None]).min(0).max())
+            raise ParameterError("tolerance", tolerance, f"{1.05 * least:.4f} m or more for a part of this size")
     else:
         chosen, tolerance = _least_tolerance(distances, depths, count, size)
         while len(chosen) < min(count, len(candidates)):  # spheres the cover had no need of, put where there is room
@@ -130,8 +133,13 @@ def _closed(centres: Points, radii: Points, targets: Points, surface: Points, ch
     # what another sample finds outside bounds what lies between the points
     radii = radii + _outside(check, centres, radii)
     radii = np.ceil(radii * 10**_DECIMALS) / 10**_DECIMALS
+    # a sphere inside another one adds nothing; of equal ones the first stays
+    hidden = cdist(centres, centres) + radii[:, None] <= radii
+    hidden &= ~(hidden.T & np.triu(np.ones_like(hidden)))
+    kept = np.flatnonzero(~hidden.any(1))
     return tuple(
-        Sphere((float(x), float(y), float(z)), float(r)) for (x, y, z), r in zip(centres, radii, strict=True) if r > 0.0
+        Sphere((float(x), float(y), float(z)), float(r))
+        for (x, y, z), r in zip(centres[kept], radii[kept], strict=True)
     )
 
 
@@ -144,11 +152,11 @@ def measure(spheres: tuple[Sphere, ...], solid: Solid, surface: Points) -> LinkF
     """Measures how tightly spheres cover a solid, and whether they cover points on its surface."""
     centres = np.array([sphere.center for sphere in spheres])
     radii = np.array([sphere.radius for sphere in spheres])
-    surface = np.vstack([centre + radius * unit_sphere(500) for centre, radius in zip(centres, radii, strict=True)])
+    shell = np.vstack([centre + radius * unit_sphere(500) for centre, radius in zip(centres, radii, strict=True)])
     area = np.repeat(radii**2, 500)
     # the outer surface: what neither another sphere nor the geometry covers
-    outer = ((cdist(surface, centres) - radii).min(1) > -1e-9) & ~solid.inside(surface)
-    excess = solid.distance(surface[outer])
+    outer = ((cdist(shell, centres) - radii).min(1) > -1e-9) & ~solid.inside(shell)
+    excess = solid.distance(shell[outer])
     return LinkFit(
         spheres,
         mean_excess=float(np.average(excess, weights=area[outer])) if outer.any() else 0.0,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from grr_torch.errors import ParameterError, UnknownNameError, UrdfError
+from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError, UrdfError
 from grr_torch.robots.chain import serial_chain
 from grr_torch.robots.kinematics import compile_tree, degrees_of_freedom
 from grr_torch.robots.presets import Preset, load_preset, robot_names
@@ -65,6 +66,8 @@ def load_robot(
         spheres = SphereModel.load(spheres, urdf.links)
     if margin is None:
         margin = preset.margin if preset else 0.0
+    elif spheres is None:
+        warnings.warn("the margin has no effect: there is no sphere file to check with", GrrWarning, stacklevel=2)
     robot = make_robot(
         urdf,
         name=preset.name if preset else urdf.name,
@@ -101,8 +104,9 @@ def make_robot(
         raise UrdfError(urdf.name, f"no movable joint between base '{base}' and tool '{tool}'")
     tree = compile_tree(urdf, path, base, tool, held, dtype=dtype, device=device)
     figures = {joint.name: [joint.lower, joint.upper, joint.velocity] for joint in moving}
-    for joint in path:
-        _add_mimic_limits(urdf, joint, figures)
+    wraps = {joint.name: joint.kind == "continuous" for joint in moving}
+    for joint in urdf.joints.values():
+        _add_mimic(urdf, joint, held, figures, wraps)
     lower, upper, velocity = (
         torch.tensor([row[k] for row in figures.values()], dtype=dtype, device=device) for k in range(3)
     )
@@ -117,7 +121,7 @@ def make_robot(
         joint_names=tuple(figures),
         lower=lower,
         upper=upper,
-        continuous=torch.tensor([joint.kind == "continuous" for joint in moving], device=device),
+        continuous=torch.tensor(list(wraps.values()), device=device),
         velocity_limits=velocity,
         held_joints=held,
         tree=tree,
@@ -154,10 +158,15 @@ def _held(urdf: Urdf, held_joints: Mapping[str, float]) -> dict[str, float]:
     return dict(held_joints)
 
 
-def _add_mimic_limits(urdf: Urdf, joint: Joint, figures: dict[str, list[float]]) -> None:
-    """Narrows the limits of the joint that drives a mimic joint by the mimic joint's own."""
+def _add_mimic(
+    urdf: Urdf, joint: Joint, held: Mapping[str, float], figures: dict[str, list[float]], wraps: dict[str, bool]
+) -> None:
+    """Narrows the limits of the joint that drives a mimic joint by the mimic joint's own.
+
+    A full turn of a continuous joint changes nothing only if it is a whole number of turns of what follows it.
+    """
     multiplier, offset, source = 1.0, 0.0, joint
-    while source.mimic is not None:
+    while source.mimic is not None and source.name not in held:
         name, factor, shift = source.mimic
         multiplier, offset, source = multiplier * factor, multiplier * shift + offset, urdf.joints[name]
     if source is joint or source.name not in figures or multiplier == 0.0:
@@ -166,3 +175,5 @@ def _add_mimic_limits(urdf: Urdf, joint: Joint, figures: dict[str, list[float]])
     driver = figures[source.name]
     driver[0], driver[1] = max(driver[0], ends[0]), min(driver[1], ends[1])
     driver[2] = min(driver[2], joint.velocity / abs(multiplier))
+    periodic = joint.kind != "prismatic" and multiplier.is_integer() and math.isinf(ends[0]) and math.isinf(ends[1])
+    wraps[source.name] = wraps[source.name] and periodic

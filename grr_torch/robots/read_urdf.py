@@ -39,7 +39,7 @@ def parse_urdf(
     package_dirs: Sequence[str | os.PathLike[str]] = (),
 ) -> Urdf:
     """Validates URDF text; see `read_urdf`. `source` names it in errors."""
-    parsed = _parse(data, source)
+    parsed, text = _parse(data, source)
     links = tuple(link.name for link in parsed.links)
     if not links:
         raise UrdfError(source, "has no <link>")
@@ -48,9 +48,9 @@ def parse_urdf(
     joints = {joint.name: _joint(joint, source) for joint in parsed.joints}
     return Urdf(
         name=parsed.name,
-        text=data.decode("utf-8", errors="replace"),
+        text=text,
         directory=directory,
-        package_dirs=tuple(Path(folder) for folder in package_dirs),
+        package_dirs=tuple(Path(folder).resolve() for folder in package_dirs),
         root=_root(links, joints, source),
         links=links,
         joints=joints,
@@ -59,7 +59,8 @@ def parse_urdf(
     )
 
 
-def _parse(data: bytes, source: str) -> Any:
+def _parse(data: bytes, source: str) -> tuple[Any, str]:
+    """What yourdfpy reads, and the text without an encoding of its own."""
     import yourdfpy
     from lxml import etree
 
@@ -78,7 +79,7 @@ def _parse(data: bytes, source: str) -> Any:
         urdf = yourdfpy.URDF.load(BytesIO(data), build_scene_graph=False, load_meshes=False)
     except (KeyError, ValueError, AttributeError, IndexError, TypeError) as error:
         raise UrdfError(source, f"is malformed: {type(error).__name__}: {error}") from error
-    return urdf.robot
+    return urdf.robot, str(etree.tostring(root, encoding="unicode"))
 
 
 def _no_duplicates(source: str, kind: str, names: Sequence[str]) -> None:
@@ -107,6 +108,8 @@ def _joint(parsed: Any, source: str) -> Joint:
     mimic = None
     if parsed.mimic is not None and parsed.type != "fixed":
         mimic = (parsed.mimic.joint, float(parsed.mimic.multiplier), float(parsed.mimic.offset))
+        if not all(map(math.isfinite, mimic[1:])):
+            raise UrdfError(source, f"{where} mimics with multiplier and offset {mimic[1:]}; valid: finite")
     return Joint(
         name=parsed.name,
         kind=parsed.type,
@@ -128,7 +131,7 @@ def _limits(parsed: Any, where: str, source: str) -> tuple[float, float]:
         return -math.inf, math.inf
     lower = 0.0 if limit.lower is None else float(limit.lower)
     upper = 0.0 if limit.upper is None else float(limit.upper)
-    if math.isnan(lower) or math.isnan(upper) or lower > upper:
+    if not lower <= upper or lower == math.inf or upper == -math.inf:
         raise UrdfError(source, f"{where} has limits lower={lower}, upper={upper}; valid: lower ≤ upper")
     return lower, upper
 
@@ -189,9 +192,15 @@ def _shapes(parsed: Sequence[Any], link: str, source: str) -> tuple[Shape, ...]:
             kind, size = "mesh", _scale(geometry.mesh.scale)
             if not geometry.mesh.filename:
                 raise UrdfError(source, f"link '{link}' has a <mesh> without a filename")
-        if not all(math.isfinite(value) and (value > 0.0 or kind == "mesh") for value in size):
-            raise UrdfError(source, f"link '{link}' has a {kind} of size {size}; valid: positive and finite")
+        wanted = {"box": 3, "cylinder": 2, "sphere": 1, "mesh": 3}[kind]
+        if len(size) != wanted or not all(
+            math.isfinite(value) and (value > 0.0 or (kind == "mesh" and value < 0.0)) for value in size
+        ):
+            valid = f"{wanted} finite values, {'not zero' if kind == 'mesh' else 'positive'}"
+            raise UrdfError(source, f"link '{link}' has a {kind} of size {size}; valid: {valid}")
         origin = np.eye(4) if item.origin is None else np.asarray(item.origin, dtype=np.float64)
+        if not np.isfinite(origin).all():
+            raise UrdfError(source, f"link '{link}' has a {kind} whose origin is not finite")
         filename = geometry.mesh.filename if kind == "mesh" else None
         shapes.append(Shape(kind, origin, size, filename))
     return tuple(shapes)
@@ -200,5 +209,5 @@ def _shapes(parsed: Sequence[Any], link: str, source: str) -> tuple[Shape, ...]:
 def _scale(scale: Any) -> tuple[float, ...]:
     if scale is None:
         return (1.0, 1.0, 1.0)
-    factors = np.broadcast_to(np.asarray(scale, dtype=np.float64), 3)
-    return tuple(factors.tolist())
+    factors = np.asarray(scale, dtype=np.float64).reshape(-1).tolist()
+    return tuple(factors * 3 if len(factors) == 1 else factors)

@@ -16,7 +16,7 @@ from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.presets import Preset
 from grr_torch.robots.self_collision import SphereKernel
 from grr_torch.robots.spheres import SphereModel
-from grr_torch.robots.urdf import Urdf
+from grr_torch.robots.urdf import Urdf, sampling_range
 
 if TYPE_CHECKING:
     from pytorch_kinematics import SerialChain
@@ -38,7 +38,8 @@ class Robot:
         joint_names: The n joints of a configuration.
         lower: (n,) lower position limits; −inf where there is none.
         upper: (n,) upper position limits; inf where there is none.
-        continuous: (n,) joints of URDF type continuous: their differences are wrapped.
+        continuous: (n,) joints of URDF type continuous: their differences are wrapped. (Not one that a mimic joint
+            follows by a broken number of turns.)
         velocity_limits: (n,) velocity limits [rad/s or m/s]; inf where there is none.
         held_joints: Values of joints that do not move.
         tree: Constants of the kinematics of all links.
@@ -155,7 +156,7 @@ class Robot:
     def self_collision_distance(self, q: Tensor) -> Tensor:
         """Signed distance (*batch,) [m] of the closest two links of the sphere model; negative in penetration.
 
-        Differentiable. The margin is not subtracted. inf where the robot has no sphere model.
+        Differentiable. The margin is not subtracted. inf where the robot has no sphere model, NaN where q is NaN.
 
         Args:
             q: (*batch, n) configurations [rad or m].
@@ -171,6 +172,8 @@ class Robot:
     def in_self_collision(self, q: Tensor) -> Tensor:
         """Whether two links are nearer than the margin: (*batch,) bool. False where there is no sphere model.
 
+        What is not finite is not known to be free: True.
+
         Args:
             q: (*batch, n) configurations [rad or m].
 
@@ -185,8 +188,13 @@ class Robot:
         Args:
             q: (*batch, n) configurations [rad or m].
             tolerance: Excess that is forgiven [rad or m].
+
+        Raises:
+            ParameterError: The last axis is not n.
         """
-        return ((q >= self.lower - tolerance) & (q <= self.upper + tolerance)).all(-1)
+        columns = self.columns(q)
+        lower, upper = (limit[:, None] for limit in (self.lower - tolerance, self.upper + tolerance))
+        return ((columns >= lower) & (columns <= upper)).all(0).reshape(q.shape[:-1])
 
     def sample(self, k: int, generator: torch.Generator | None = None) -> Tensor:
         """Draws (k, n) configurations, uniform within limits; ±π rad or ±1 m where a joint has none.
@@ -200,10 +208,9 @@ class Robot:
         """
         if k < 0:
             raise ParameterError("k", k, "0 or more")
-        revolute = torch.tensor([self.urdf.joints[name].kind != "prismatic" for name in self.joint_names])
-        reach = torch.where(revolute, math.pi, 1.0).to(self.lower)
-        lower = torch.where(self.lower.isfinite(), self.lower, torch.minimum(-reach, self.upper - 2.0 * reach))
-        upper = torch.where(self.upper.isfinite(), self.upper, torch.maximum(reach, self.lower + 2.0 * reach))
+        kinds = [self.urdf.joints[name].kind for name in self.joint_names]
+        limits = zip(kinds, self.lower.tolist(), self.upper.tolist(), strict=True)
+        lower, upper = self.lower.new_tensor([sampling_range(*limit) for limit in limits]).T
         # drawn on the CPU, so that a seed gives the same configurations on every device
         unit = torch.rand(k, self.n, dtype=self.dtype, generator=generator).to(self.device)
         return lower + (upper - lower) * unit

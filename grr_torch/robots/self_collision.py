@@ -93,7 +93,9 @@ class SphereKernel:
                 columns.append(chunk)
                 # the floor keeps the gradient finite where two centres coincide
                 distances.append((squared.clamp_min(1e-24).sqrt() - reach).flatten(0, 1).amin(0))
-        result = lower.new_full((lower.shape[1],), torch.inf)
+        result = torch.where(cutoff.isnan(), torch.nan, torch.inf).to(lower)
+        if not columns:
+            return result
         return result.scatter_reduce(0, torch.cat(columns), torch.cat(distances), "amin")
 
     def collides(self, tree: KinematicTree, q: Tensor, margin: float) -> Tensor:
@@ -102,8 +104,9 @@ class SphereKernel:
 
     def _collides(self, frames: Sequence[Frame], margin: float) -> Tensor:
         centres = self._centres(frames)
-        near_pairs = self._bound_distances(centres) < margin
-        hit = torch.zeros(near_pairs.shape[1], dtype=torch.bool, device=near_pairs.device)
+        bound_distances = self._bound_distances(centres)
+        near_pairs = bound_distances < margin
+        hit = bound_distances.isnan().any(0)
         for pair in near_pairs.any(1).nonzero()[:, 0].tolist():
             near = (near_pairs[pair] & ~hit).nonzero()[:, 0]
             for chunk, squared, reach in self._sphere_pairs(centres, pair, near):

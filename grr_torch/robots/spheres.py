@@ -129,6 +129,8 @@ def _link(name: Any, links: Sequence[str]) -> str:
 
 
 def _spheres(source: str, link: str, items: Any) -> tuple[Sphere, ...]:
+    if not isinstance(items, list | None):
+        raise FileFormatError(source, f"link '{link}': got {items}; valid: a list of spheres")
     spheres: list[Sphere] = []
     for item in items or []:
         try:

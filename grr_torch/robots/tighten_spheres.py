@@ -45,7 +45,7 @@ def tighten(
     r = torch.tensor(radii, requires_grad=True)
     field = _DistanceField(solid, size)
     boundary, inside = torch.tensor(solid.boundary), torch.tensor(inner)
-    directions = _directions(max(16, _SURFACE // len(c)))
+    directions = torch.tensor(unit_sphere(max(16, _SURFACE // len(c))))
     own = torch.arange(len(c)).repeat_interleave(len(directions))
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam([c, r], lr=_RATE * size)
@@ -88,10 +88,6 @@ class _DistanceField:
         grid = unit.flip(-1)[None, :, None, None]
         values = grid_sample(self._values, grid, align_corners=True, padding_mode="border")
         return values.reshape(-1).clamp_min(0.0)
-
-
-def _directions(count: int) -> Tensor:
-    return torch.tensor(unit_sphere(count))
 
 
 def unit_sphere(count: int) -> Points:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,7 +30,7 @@ class Joint:
         axis: (3,) unit axis in the joint's frame.
         lower: Lower position limit [rad or m]; −inf where there is none.
         upper: Upper position limit [rad or m]; inf where there is none.
-        velocity: Velocity limit [rad/s or m/s]; inf where there is none.
+        velocity: Velocity limit [rad/s or m/s]; inf where there is none, or 0, which files write for unknown.
         mimic: (joint, multiplier, offset) where this joint follows another.
     """
 
@@ -48,6 +49,14 @@ class Joint:
     def movable(self) -> bool:
         """Whether the joint can move at all."""
         return self.kind != "fixed"
+
+
+def sampling_range(kind: str, lower: float, upper: float) -> tuple[float, float]:
+    """Where random values of a joint are drawn: its limits; ±π rad or ±1 m where there are none."""
+    reach = 1.0 if kind == "prismatic" else math.pi
+    if not math.isfinite(lower):
+        lower = min(-reach, upper - 2.0 * reach)
+    return lower, upper if math.isfinite(upper) else max(reach, lower + 2.0 * reach)
 
 
 @dataclass(frozen=True)

@@ -12,17 +12,17 @@ from torch import Tensor
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Angles in [−π, π) [rad]."""
+    """Angles in [−π, π] [rad]."""
     return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
 
 
 def normalise(q: Tensor, continuous: Tensor) -> Tensor:
-    """The same configurations with continuous joints in [−π, π)."""
+    """The same configurations with continuous joints in [−π, π]."""
     return torch.where(continuous, wrap(q), q)
 
 
 def difference(start: Tensor, end: Tensor, continuous: Tensor) -> Tensor:
-    """The shortest motion end − start (*batch, n); continuous joints in [−π, π)."""
+    """The shortest motion end − start (*batch, n); continuous joints in [−π, π]."""
     return normalise(end - start, continuous)
 
 

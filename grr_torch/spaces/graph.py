@@ -17,7 +17,8 @@ from grr_torch.errors import ParameterError
 
 Bounds = Sequence[tuple[float, float]]
 
-_MOST_POINTS = 20_000_000
+# neighbour tables of a larger graph would not fit a laptop
+_MOST_POINTS = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +32,18 @@ class TaskGraph:
 
     points: Tensor
     edges: Tensor
+
+    def __post_init__(self) -> None:
+        points, edges = self.points, self.edges
+        if points.ndim != 2 or points.dtype != torch.float64 or len(points) == 0 or not bool(points.isfinite().all()):
+            shape = f"{points.dtype} of shape {tuple(points.shape)}"
+            raise ParameterError("points of a graph", shape, "finite torch.float64 of shape (V, d), V ≥ 1")
+        inside = edges.dtype == torch.int64 and edges.ndim == 2 and edges.shape[1] == 2
+        if not inside or bool(((edges < 0) | (edges >= len(points))).any()):
+            shape = f"{edges.dtype} of shape {tuple(edges.shape)}"
+            raise ParameterError("edges of a graph", shape, f"torch.int64 of shape (E, 2), from 0 to {len(points) - 1}")
+        if len(torch.unique(points, dim=0)) < len(points):
+            raise ParameterError("points of a graph", "two that coincide", "points that differ")
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -69,8 +82,11 @@ def check_bounds(bounds: Bounds) -> tuple[tuple[float, float], ...]:
     Raises:
         ParameterError: They are not two or three finite intervals of positive length.
     """
-    pairs = tuple((float(low), float(high)) for low, high in bounds)
     valid = "two or three intervals, low < high, finite, in metres"
+    try:
+        pairs = tuple((float(low), float(high)) for low, high in bounds)
+    except (TypeError, ValueError) as error:
+        raise ParameterError("bounds", bounds, valid) from error
     if len(pairs) not in (2, 3) or not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in pairs):
         raise ParameterError("bounds", pairs, valid)
     return pairs

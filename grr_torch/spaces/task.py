@@ -47,6 +47,11 @@ class TaskSpace(ABC):
             raise ParameterError("task dimension", self.dimension, "2 or 3")
 
     @property
+    def width(self) -> int:
+        """Entries of a point: its position, as long as rotation does not vary."""
+        return self.dimension
+
+    @property
     @abstractmethod
     def constraints(self) -> int:
         """How many equations a point imposes on a configuration."""
