@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +19,7 @@ def build(
     task: Annotated[str | None, typer.Option(help="position or fixed-rotation; the preset's default.")] = None,
     points: Annotated[int | None, typer.Option(help="Vertices that the staggered grid is asked for.")] = None,
     seeds: Annotated[str, typer.Option(help="preset, or a .csv, .txt or .npy FILE, one seed a row.")] = "preset",
-    out: Annotated[Path | None, typer.Option(help="Roadmap file; by default ROBOT.grr.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Roadmap file; by default ROBOT.grr. Replaced if it exists.")] = None,
     record: Annotated[Path | None, typer.Option(help="Recording; by default beside the roadmap, .rrd.")] = None,
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
     reachability: Annotated[
@@ -33,7 +34,10 @@ def build(
     ] = None,
     rotation: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(help="Fixed-axis roll, pitch, yaw of the tool in radians, for fixed-rotation.", metavar="R P Y"),
+        typer.Option(
+            help="Fixed-axis roll, pitch, yaw of the tool in radians, for fixed-rotation; 0 0 0 without a preset.",
+            metavar="R P Y",
+        ),
     ] = None,
     package_dir: Annotated[list[Path] | None, typer.Option(help="Folder for package:// meshes; repeatable.")] = None,
     hold: Annotated[list[str] | None, typer.Option(help="Hold a joint still; repeatable.", metavar="J=VALUE")] = None,
@@ -64,10 +68,11 @@ def build(
             held_joints=_held(hold or []),
             spheres=spheres,
             margin=margin,
-            device=_device(device),
+            device=device,
         )
         progress("loading the robot", 1, 1)
-        out = out or Path(f"{arm.name}.grr")
+        out = out or Path(f"{Path(robot).stem}.grr")
+        _keep_inputs(out, record, [robot, seeds, spheres])
         check_writable(out)
         recording = None if no_record else record or out.with_suffix(".rrd")
         if recording is not None:
@@ -101,10 +106,20 @@ def build(
         files = {"out": str(out), "record": None if recording is None else str(recording)}
         print_json({**quality, "build_seconds": roadmap.build_seconds, **files})
         return
-    title = f"{arm.name}, {roadmap.task.kind} in {roadmap.task.name}"
+    rotation = roadmap.task.to_json().get("rotation")
+    turned = "" if rotation is None else f", roll pitch yaw {' '.join(f'{angle:.4g}' for angle in rotation)} rad"
+    title = f"{arm.name}, {roadmap.task.kind} in {roadmap.task.name}{turned}"
     written = str(out) if recording is None else f"{out}, {recording} (grr-torch view {out})"
     rows = [("built in", f"{roadmap.build_seconds:.2f} s (the algorithm alone)"), ("written", written)]
     print_rows(title, [*quality_rows(quality), *rows])
+
+
+def _keep_inputs(out: Path, record: Path | None, inputs: Sequence[str | Path | None]) -> None:
+    """Refuses to write over what is read."""
+    given = {Path(path).resolve() for path in inputs if path is not None and Path(path).is_file()}
+    for name, path in (("--out", out), ("--record", record)):
+        if path is not None and path.resolve() in given:
+            raise ParameterError(name, path, "another file than those that are read")
 
 
 def _task(
@@ -140,20 +155,10 @@ def _held(items: list[str]) -> dict[str, float]:
     held: dict[str, float] = {}
     for item in items:
         name, _, value = item.partition("=")
+        if name in held:
+            raise ParameterError("--hold", repr(item), f"one value for '{name}'")
         try:
             held[name] = float(value)
         except ValueError as error:
             raise ParameterError("--hold", repr(item), "JOINT=VALUE, the value in radians or metres") from error
     return held
-
-
-def _device(name: str) -> Any:
-    import torch
-
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        available = "cpu, cuda" if torch.cuda.is_available() else "cpu (no CUDA device is available)"
-        raise ParameterError("--device", name, available) from error
-    return device

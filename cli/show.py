@@ -69,17 +69,11 @@ def print_json(data: dict[str, Any]) -> None:
 
 
 def print_rows(title: str, rows: list[tuple[str, str]]) -> None:
-    """A table of names and values on standard output."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=title, title_justify="left", show_header=False, box=None, pad_edge=False)
-    table.add_column(style="bold")
-    table.add_column()
+    """Names and values on standard output, a line each, however narrow the terminal."""
+    typer.secho(title, bold=True)
+    width = max(len(name) for name, _ in rows)
     for name, value in rows:
-        table.add_row(Text(name), Text(value))
-    Console().print(table)
+        typer.echo(f"{name:{width}}  {value}")
 
 
 def quality_rows(quality: dict[str, Any]) -> list[tuple[str, str]]:

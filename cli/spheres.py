@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 from grr_torch.cli.show import print_json, progress_bar, reports_errors
 
+from grr_torch.errors import ParameterError
+
 
 @reports_errors
 def spheres(
@@ -40,6 +42,8 @@ def spheres(
     from grr_torch.robots.read_urdf import read_urdf
     from grr_torch.robots.spheres import SphereModel
 
+    if out.resolve() == urdf.resolve():
+        raise ParameterError("--out", out, "another file than the URDF")
     check_writable(out)
     robot = read_urdf(urdf, package_dir or ())
     with progress_bar() as progress:

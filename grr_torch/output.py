@@ -15,14 +15,16 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     """Finds out before the work starts whether `path` could be written.
 
     Raises:
-        OutputError: Its folder is missing or not writable, or it is a folder itself.
+        OutputError: Its folder is missing or not writable, or it is there and no regular file.
     """
     path = Path(path)
-    if path.is_dir():
-        raise OutputError(path, "it is a folder")
-    if not path.parent.is_dir():
-        raise OutputError(path, f"folder '{path.parent}' does not exist")
     try:
+        if path.is_dir():
+            raise OutputError(path, "it is a folder")
+        if path.exists() and not path.is_file():
+            raise OutputError(path, "it exists and is not a regular file")
+        if not path.parent.is_dir():
+            raise OutputError(path, f"folder '{path.parent}' does not exist")
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
@@ -36,7 +38,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         OutputError: The file cannot be written.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))  # a link stays one: what it points to is replaced
     check_writable(path)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=f".partial{path.suffix}", dir=path.parent)
     os.close(handle)

@@ -187,13 +187,23 @@ def test_seed_files_are_read(tmp_path):
         ({"reachability": -1}, "reachability: got -1"),
         ({"bounds": [(1, -1), (0, 1), (0, 1)]}, "low < high"),
         ({"task": grr_torch.Position(2)}, "2 for R2"),
+        (
+            {"points": 10, "task": grr_torch.Position(3), "robot": "planar_3", "bounds": [(0, 0.2)] * 3},
+            "stays in a plane",
+        ),
         ({"task": grr_torch.FixedRotation(2), "bounds": [(-1, 1), (-1, 1)]}, "tool leaves the plane"),
     ],
 )
 def test_bad_parameters_are_errors(kinova, options, complaint):
-    task = options.pop("task", "position")
+    task, name = options.pop("task", "position"), options.pop("robot", None)
+    robot = grr_torch.load_robot(name) if name else kinova
     with pytest.raises(ParameterError, match=complaint):
-        grr_torch.build(kinova, task, **options)
+        grr_torch.build(robot, task, **options)
+
+
+def test_bounds_in_centimetres_are_warned_of(planar_5):
+    with pytest.warns(GrrWarning, match=r"only \d+ of 313 points lie within 0.500 m .* are the bounds in metres"):
+        grr_torch.build(planar_5, "position", points=300, bounds=[(-50, 50), (-50, 50)])
 
 
 def test_an_unknown_task_lists_the_known(kinova):
@@ -202,7 +212,7 @@ def test_an_unknown_task_lists_the_known(kinova):
 
 
 def test_a_robot_without_preset_must_be_told_everything(box_arm):
-    with pytest.raises(ParameterError, match="points and bounds"):
+    with pytest.raises(ParameterError, match="points and bounds: got nothing"):
         grr_torch.build(grr_torch.load_robot(box_arm), "position")
     with pytest.raises(SeedError, match="no preset"):
         grr_torch.build(grr_torch.load_robot(box_arm), "position", points=50, bounds=[(-0.5, 0.5)] * 3)

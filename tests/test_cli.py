@@ -176,12 +176,22 @@ def test_spheres_are_fitted_and_used(box_arm, tmp_path):
         ("build --robot planar_5 --hold joint_1", "JOINT=VALUE"),
         ("build --robot planar_5 --hold elbow=1", "unknown joint 'elbow'"),
         ("build --robot planar_5 --margin -1", "margin: got -1.0"),
-        ("build --robot planar_5 --device tpu9", "--device: got tpu9"),
+        ("build --robot planar_5 --device tpu9", "device: got tpu9"),
         ("build --robot planar_5 --out no/such/f.grr", "folder 'no/such' does not exist"),
         ("build --robot planar_5 --out .", "it is a folder"),
         ("build --robot planar_5 --task position --rotation 0 0 1", "none for the task 'position'"),
         ("build --robot kinova --spheres words.csv", "is not a sphere file"),
         ("build --robot planar_5 --reachability -3", "reachability: got -3"),
+        ("build --robot planar_5 --seeds short.csv --out short.csv", "another file than those that are read"),
+        ("build --robot planar_5 --out fifo", "not a regular file"),
+        ("build --robot fifo", "fifo: is not a regular file"),
+        ("build --robot xacro.urdf", "is xacro, not URDF"),
+        ("build --robot doctype.urdf", "has a DOCTYPE"),
+        ("build --robot planar_5 --hold joint_1=0 --hold joint_1=1", "one value for 'joint_1'"),
+        ("build --robot planar_5 --bounds -1e300 1e300 0 1", "low < high"),
+        ("build --robot planar_5 --seed 99999999999999999999", "seed: got 99999999999999999999"),
+        ("build --robot planar_5 --seeds gap.csv", "is not a table of numbers"),
+        ("build --robot planar_5 --reachability 99999999", "reachability: got 99999999"),
         ("build --robot planar_5 --out x.rrd", "another file than the roadmap's"),
         ("build --robot planar_5 --seed -1", "Invalid value for '--seed'"),
         ("info none.grr", "none.grr: is not a file"),
@@ -197,7 +207,11 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(tmp_path, words, complaint)
     (tmp_path / "short.csv").write_text("0 0 0")
     (tmp_path / "nan.csv").write_text("0 0 0 0 nan")
     (tmp_path / "words.csv").write_text("no numbers here")
+    (tmp_path / "gap.csv").write_text("0.5,,0.5,0.5,0.5,0.5")
+    (tmp_path / "xacro.urdf").write_text('<robot name="r" xmlns:xacro="x/xacro"><xacro:macro name="m"/></robot>')
+    (tmp_path / "doctype.urdf").write_text('<!DOCTYPE r [<!ENTITY a "b">]><robot name="r"><link name="a"/>&a;</robot>')
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    os.mkfifo(tmp_path / "fifo")
     result = run(*words.split(), cwd=tmp_path)
     assert result.returncode == 2
     assert complaint in result.stderr
@@ -205,7 +219,7 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(tmp_path, words, complaint)
     assert result.stdout == ""
     if result.stderr.startswith("error: "):
         assert result.stderr.count("\n") == 1
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
 
 
 def test_ctrl_c_leaves_no_file(tmp_path):

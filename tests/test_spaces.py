@@ -160,6 +160,7 @@ def test_tasks_survive_json():
         ("position", 3, (0, 0, 0)),
         ("fixed-rotation", 3, (0, 0)),
         ("fixed-rotation", 3, (0, 0, math.nan)),
+        ("fixed-rotation", 3, (180.0, 0, 90.0)),
         ("fixed-rotation", 2, (1.0, 0, 0)),
     ],
 )

@@ -222,7 +222,7 @@ def test_a_base_that_is_not_above_the_tool_is_an_error(load):
 
 def test_a_tree_with_several_ends_asks_for_the_tool(load):
     text = robot_text(hinge("i", "a", "b"), hinge("j", "a", "c"), links="abc")
-    with pytest.raises(UnknownNameError, match="Ends of chains: b, c"):
+    with pytest.raises(ParameterError, match="several ends: b, c"):
         load(text)
 
 

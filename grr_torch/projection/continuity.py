@@ -60,12 +60,12 @@ def is_continuous(
         raise ParameterError("c", c, "above 0.5")
     if not 0.0 < epsilon < math.inf:
         raise ParameterError("epsilon", epsilon, "above 0")
+    p = (point_columns(robot, task, points_a).T, point_columns(robot, task, points_b).T)
+    q = (robot.columns(configurations_a).T, robot.columns(configurations_b).T)
     batch = points_a.shape[:-1]
     if any(part.shape[:-1] != batch for part in (points_b, configurations_a, configurations_b)):
         shapes = tuple(tuple(part.shape) for part in (points_a, points_b, configurations_a, configurations_b))
         raise ParameterError("points and configurations", shapes, "equal batch shapes")
-    p = (point_columns(robot, task, points_a).T, point_columns(robot, task, points_b).T)
-    q = (robot.columns(configurations_a).T, robot.columns(configurations_b).T)
     if not bool(q[0].isfinite().all() & q[1].isfinite().all()):
         raise ParameterError("configurations", "NaN or infinite values", "finite values")
     return _check(robot, task, p, q, c, epsilon, tolerances).reshape(batch)

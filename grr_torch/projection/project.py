@@ -48,7 +48,7 @@ class Tolerances:
         for name in ("position", "rotation"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise ParameterError(f"{name} tolerance", getattr(self, name), "above 0")
-        if self.iterations < 1:
+        if not isinstance(self.iterations, int) or self.iterations < 1:
             raise ParameterError("iterations", self.iterations, "1 or more")
 
 
@@ -81,10 +81,10 @@ def project(
     Raises:
         ParameterError: Shapes do not fit, or an input is not finite.
     """
-    if points.shape[:-1] != guesses.shape[:-1]:
-        raise ParameterError("points and guesses", (tuple(points.shape), tuple(guesses.shape)), "equal batch shapes")
     targets = point_columns(robot, task, points)
     q = robot.columns(guesses)
+    if points.shape[:-1] != guesses.shape[:-1]:
+        raise ParameterError("points and guesses", (tuple(points.shape), tuple(guesses.shape)), "equal batch shapes")
     if not bool(q.isfinite().all()):
         raise ParameterError("guesses", "NaN or infinite values", "finite values")
     solved, valid = project_columns(robot, task, targets, q, tolerances, check_collision)
@@ -97,6 +97,8 @@ def point_columns(robot: Robot, task: TaskSpace, points: Tensor) -> Tensor:
     Raises:
         ParameterError: The width is not the task's, or a value is not finite.
     """
+    if not isinstance(points, Tensor) or points.is_complex():
+        raise ParameterError("points", type(points).__name__, "a real torch tensor")
     if points.ndim == 0 or points.shape[-1] != task.width:
         raise ParameterError("point shape", tuple(points.shape), f"(*batch, {task.width})")
     columns = points.to(device=robot.device, dtype=robot.dtype).reshape(-1, points.shape[-1]).T.contiguous()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import asdict
 
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError, SeedError, UnknownNameError, check_seed
+from grr_torch.errors import GrrWarning, ParameterError, SeedError, UnknownNameError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
@@ -22,6 +23,7 @@ from grr_torch.spaces.task import TaskSpace, make_task
 
 # edges whose continuity is checked together
 _EDGES_AT_ONCE = 16384
+_MOST_STARTS = 100_000
 
 
 def build(
@@ -63,13 +65,10 @@ def build(
     """
     task, graph, seeds = _problem(robot, task, points, bounds, seeds)
     check_task(robot, task)
-    if not bool(within_reach(robot, task, graph.points).any()):
-        centre, radius = reach(robot)
-        place = ", ".join(f"{value:.3f}" for value in centre.tolist())
-        raise ParameterError("bounds", "no point within reach", f"points within {radius:.3f} m of ({place})")
+    _check_reach(robot, task, graph)
     check_seed(seed)
-    if reachability < 0:
-        raise ParameterError("reachability", reachability, "0 or more random starts a vertex")
+    if not 0 <= reachability <= _MOST_STARTS:
+        raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
     begin = time.perf_counter()
     expansion = expand(robot, task, graph, seeds, neighbours=neighbours, tolerances=tolerances, progress=progress)
     connected = _connected(robot, task, graph, expansion.configurations, expansion.resolved, tolerances, progress)
@@ -116,14 +115,32 @@ def check_task(robot: Robot, task: TaskSpace) -> None:
     """Checks that a robot can be asked for this task.
 
     Raises:
-        ParameterError: An SE(2) task for a robot that leaves the plane.
+        ParameterError: An SE(2) task for a robot that leaves the plane, or a task in space for one that does not.
     """
-    if task.dimension == 2 and task.constraints > 2:
-        _, rotation = robot.forward_kinematics(robot.sample(64, torch.Generator().manual_seed(0)))
-        if not bool(((rotation[:, 2, 2].abs() - 1.0).abs() < 1e-5).all()):
-            raise ParameterError(
-                "task", f"{task.kind} in {task.name}", f"SE(3) for {robot.name}, whose tool leaves the plane"
-            )
+    position, rotation = robot.forward_kinematics(robot.sample(64, torch.Generator().manual_seed(0)))
+    upright = bool(((rotation[:, 2, 2].abs() - 1.0).abs() < 1e-5).all())
+    flat = upright and bool((position[:, 2] - position[0, 2]).abs().max() < 1e-5)
+    given = f"{task.kind} in {task.name}"
+    if task.dimension == 2 and task.constraints > 2 and not upright:
+        raise ParameterError("task", given, f"SE(3) for {robot.name}, whose tool leaves the plane")
+    if task.dimension == 3 and flat:
+        raise ParameterError("task", given, f"two axes for {robot.name}, whose tool stays in a plane")
+
+
+def _check_reach(robot: Robot, task: TaskSpace, graph: TaskGraph) -> None:
+    """Warns where next to nothing of a graph lies within the arm's reach.
+
+    Raises:
+        ParameterError: Nothing does.
+    """
+    inside = int(within_reach(robot, task, graph.points).sum())
+    centre, radius = reach(robot)
+    place = ", ".join(f"{value:.3f}" for value in centre.tolist())
+    if inside == 0:
+        raise ParameterError("bounds", "no point within reach", f"points within {radius:.3f} m of ({place})")
+    if inside < 0.02 * len(graph.points):
+        text = f"only {inside} of {len(graph.points)} points lie within {radius:.3f} m of ({place}), the arm's reach"
+        warnings.warn(f"{text}: are the bounds in metres?", GrrWarning, stacklevel=3)
 
 
 def _problem(
@@ -138,17 +155,18 @@ def _problem(
     kind = task.kind if isinstance(task, TaskSpace) else task or (preset.default_task if preset else None)
     problem = preset.problems.get(kind or "") if preset else None
     if isinstance(task, str) and preset and problem is None and bounds is None:
-        raise UnknownNameError(f"task of robot '{robot.name}'", task, tuple(preset.problems))
+        raise UnknownNameError("task", task, tuple(preset.problems))
     if bounds is None and problem is not None:
         bounds = problem.bounds
     if points is None and problem is not None:
         points = problem.points
     if points is None or (bounds is None and not isinstance(points, TaskGraph)):
-        raise ParameterError("points and bounds", "not given", "both, for a robot without a preset")
+        missing = "bounds" if points is not None else "points" if bounds is not None else "points and bounds"
+        raise ParameterError(missing, "nothing", f"they must be given for {robot.name}, which has no preset for this")
     graph = points if isinstance(points, TaskGraph) else staggered_grid(bounds or (), points)
     if seeds is None:
         if problem is None:
-            raise SeedError(f"no seeds were given, and {robot.name} has no preset for this task")
+            raise SeedError(f"no seeds were given (--seeds FILE), and {robot.name} has no preset for this task")
         seeds = problem.seeds
     if not isinstance(task, TaskSpace):
         if kind is None:

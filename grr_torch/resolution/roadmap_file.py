@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -62,6 +62,7 @@ def save_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
         "quality": roadmap.quality().to_dict(),
         "tensors_sha256": tensors_hash(tensors),
     }
+    metadata["metadata_sha256"] = metadata_hash(metadata)
     with atomic_write(path) as temporary:
         save_file(tensors, temporary, metadata={key: json.dumps(value) for key, value in metadata.items()})
 
@@ -74,8 +75,9 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
         missing = {field.name for field in fields(Quality)} - set(metadata["quality"])
         if missing:
             raise FileFormatError(path, f"lacks the quality figures {', '.join(sorted(missing))}")
-        if not all(value is None or isinstance(value, int | float) for value in metadata["quality"].values()):
-            raise FileFormatError(path, "has quality figures that are not numbers")
+        for name, hint in get_type_hints(Quality).items():
+            if not isinstance(metadata["quality"][name], hint):
+                raise FileFormatError(path, f"has a quality figure '{name}' that is no such number")
         robot = _robot_from_json(metadata["robot"])
         task = task_from_json(metadata["task"])
         parameters, seconds = dict(metadata["parameters"]), float(metadata["build_seconds"])
@@ -136,6 +138,12 @@ def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
         digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
         digest.update(tensor.view(torch.uint8).numpy().tobytes() if tensor.numel() else b"")
     return digest.hexdigest()
+
+
+def metadata_hash(metadata: Mapping[str, Any]) -> str:
+    """SHA-256 over everything in the metadata but this hash itself."""
+    others = {name: value for name, value in metadata.items() if name != "metadata_sha256"}
+    return hashlib.sha256(json.dumps(others, sort_keys=True).encode()).hexdigest()
 
 
 def _robot_to_json(robot: Robot) -> dict[str, Any]:
@@ -209,6 +217,7 @@ def _check_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) 
     demand(bool(tensors["points"].isfinite().all()), "has points that are not finite")
     finite = tensors["configurations"].isfinite().all(1)
     demand(bool((finite == resolved).all()), "has resolved vertices without a finite configuration, or the reverse")
+    demand(bool((tensors["wave"] < vertices).all()), "has waves later than there are vertices")
     demand(bool((tensors["wave"] >= 0).eq(resolved).all()), "has waves that do not fit what is resolved")
     demand(not bool((resolved & ~tensors.get("reachable", resolved)).any()), "has resolved vertices not reachable")
     demand(bool(resolved[edges[tensors["connected"]]].all()), "has connected edges to unresolved vertices")

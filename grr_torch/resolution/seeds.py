@@ -6,7 +6,9 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -36,14 +38,15 @@ def read_seeds(path: str | os.PathLike[str]) -> Tensor:
         if path.suffix == ".npy":
             table = np.load(path, allow_pickle=False)
         else:
-            text = path.read_text(encoding="utf-8").replace(",", " ")
-            rows = [line.split("#")[0].split() for line in text.splitlines()]
+            lines = [line.split("#")[0].strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+            rows = [line.split(",") if "," in line else line.split() for line in lines]
             table = np.array([[float(value) for value in row] for row in rows if row], dtype=np.float64)
     except OSError as error:
         raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError) as error:
-        raise FileFormatError(path, f"is not a table of numbers with rows of one length: {error}") from error
-    if table.ndim != 2 or table.size == 0 or table.dtype.kind not in "fi":
+    except (ValueError, EOFError, MemoryError, TokenError, BadZipFile) as error:
+        reason = "is not a table of numbers with rows of one length, and no header"
+        raise FileFormatError(path, reason) from error
+    if not isinstance(table, np.ndarray) or table.ndim != 2 or table.size == 0 or table.dtype.kind not in "fi":
         raise FileFormatError(path, "is not a table of numbers with one seed a row")
     return torch.from_numpy(table.astype(np.float64))
 
@@ -55,8 +58,8 @@ def check_seeds(robot: Robot, seeds: SeedsLike) -> Tensor:
         SeedError: There are none, they have another length than n, or hold NaN.
     """
     try:
-        table = torch.as_tensor(seeds, dtype=robot.dtype)
-    except (ValueError, TypeError) as error:
+        table = torch.as_tensor(seeds, dtype=robot.dtype).detach()
+    except (ValueError, TypeError, OverflowError) as error:
         raise SeedError(f"seeds are not a table of numbers: {error}") from error
     if table.ndim != 2 or table.shape[1] != robot.n:
         raise SeedError(

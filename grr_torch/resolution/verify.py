@@ -10,7 +10,7 @@ from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.build import check_edges
 from grr_torch.resolution.quality import quality_differences
-from grr_torch.resolution.roadmap_file import load_roadmap, read_file, tensors_hash
+from grr_torch.resolution.roadmap_file import load_roadmap, metadata_hash, read_file, tensors_hash
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ def verify_file(path: str | os.PathLike[str], *, progress: Progress = silent) ->
             hashlib.sha256(robot["urdf"].encode()).hexdigest() == robot.get("urdf_sha256"),
             f"SHA-256 {str(robot.get('urdf_sha256'))[:12]}…",
         ),
+        Check("metadata", metadata_hash(metadata) == metadata.get("metadata_sha256"), "SHA-256 of all entries"),
         Check("quality", not differing, f"differs in {', '.join(differing)}" if differing else "as stored"),
         Check(
             "residuals",

@@ -81,8 +81,8 @@ def fit_spheres(
     if tolerance is not None and not 1e-4 <= tolerance < np.inf:
         raise ParameterError("tolerance", tolerance, "0.0001 m or more")
     check_seed(seed)
-    if starts < 0:
-        raise ParameterError("starts", starts, "0 or more")
+    if not 0 <= starts <= 100:
+        raise ParameterError("starts", starts, "0 to 100")
     links = [link for link, shapes in urdf.collisions.items() if shapes]
     if not links:
         raise UrdfError(urdf.name, "no link has collision geometry to fit spheres to")
@@ -99,6 +99,8 @@ def fit_spheres(
 
 def _fit_link(meshes: list[Trimesh], count: int | None, tolerance: float | None, starts: int, seed: int) -> LinkFit:
     size = float(np.linalg.norm(np.ptp(np.vstack([mesh.bounds for mesh in meshes]), axis=0)))
+    if not 1e-5 < size < 1e4:
+        raise ParameterError("collision geometry", f"a part {size:g} m large", "1e-5 to 1e4 m")
     solid = Solid.sampled(meshes, _spacing(size), seed)
     candidates, depths = _candidates(solid, size)
     inner = candidates[:: max(1, len(candidates) // 1000)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -50,11 +51,22 @@ def _shape_mesh(urdf: Urdf, link: str, shape: Shape) -> Trimesh:
 
 def _read_mesh(urdf: Urdf, link: str, shape: Shape) -> Trimesh:
     import trimesh
+    from collada.common import DaeError
 
     path = urdf.mesh_path(str(shape.filename), link)
     try:
         mesh = trimesh.load_mesh(path)
-    except (ValueError, OSError, KeyError, IndexError, TypeError, NotImplementedError, ImportError) as error:
+    except (
+        ValueError,
+        OSError,
+        KeyError,
+        IndexError,
+        TypeError,
+        NotImplementedError,
+        ImportError,
+        DaeError,
+        BadZipFile,
+    ) as error:
         raise UrdfError(path, f"mesh of link '{link}' cannot be read: {error}") from error
     if not isinstance(mesh, trimesh.Trimesh):
         mesh = mesh.to_mesh()

@@ -51,7 +51,8 @@ def load_robot(
         UrdfError: The URDF is malformed or has no movable joint between base and tool.
         MeshNotFoundError: A mesh that it names is missing.
         FileFormatError: The sphere file is not one.
-        ParameterError: A held value, the margin or the dtype is not valid.
+        ParameterError: No tool is given for a URDF with several ends, or a held value, the margin, the device or the
+            dtype is not valid.
     """
     if dtype not in (torch.float64, torch.float32):
         raise ParameterError("dtype", dtype, "torch.float64 or torch.float32")
@@ -76,7 +77,7 @@ def load_robot(
         held_joints=held_joints or {},
         spheres=spheres,
         margin=margin,
-        device=torch.device(device or "cpu"),
+        device=_device(device),
         dtype=dtype,
     )
     return replace(robot, preset=preset)
@@ -130,6 +131,21 @@ def make_robot(
     ).with_margin(margin)
 
 
+def _device(device: torch.device | str | None) -> torch.device:
+    """The device, after a first tensor was put on it.
+
+    Raises:
+        ParameterError: There is no such device.
+    """
+    try:
+        found = torch.device(device or "cpu")
+        torch.zeros(1, device=found).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
+        available = "cpu, cuda" if torch.cuda.is_available() else "cpu (no CUDA device is available)"
+        raise ParameterError("device", device, available) from error
+    return found
+
+
 def _preset(name_or_path: str | os.PathLike[str]) -> Preset | None:
     """The preset of a bundled name; None for what is, or looks like, a path."""
     text = os.fspath(name_or_path)
@@ -143,7 +159,7 @@ def _preset(name_or_path: str | os.PathLike[str]) -> Preset | None:
 def _only_leaf(urdf: Urdf) -> str:
     leaves = urdf.leaves()
     if len(leaves) > 1:
-        raise UnknownNameError("tool frame", "(none given)", urdf.links, f" Ends of chains: {', '.join(leaves)}.")
+        raise ParameterError("tool", "nothing", f"one of the links, as the URDF has several ends: {', '.join(leaves)}")
     return leaves[0]
 
 

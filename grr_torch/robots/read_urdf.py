@@ -14,6 +14,8 @@ import numpy as np
 from grr_torch.errors import UrdfError
 from grr_torch.robots.urdf import Joint, Shape, Urdf
 
+# metres beyond which an origin is a mistake
+_FARTHEST = 1e6
 SUPPORTED_TYPES = ("revolute", "continuous", "prismatic", "fixed")
 
 
@@ -25,6 +27,8 @@ def read_urdf(path: str | os.PathLike[str], package_dirs: Sequence[str | os.Path
     """
     path = Path(path)
     try:
+        if path.exists() and not path.is_file():
+            raise UrdfError(path, "is not a regular file")
         data = path.read_bytes()
     except OSError as error:
         raise UrdfError(path, f"cannot be read: {error.strerror}") from error
@@ -71,12 +75,16 @@ def _parse(data: bytes, source: str) -> tuple[Any, str]:
         root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True))
     except etree.XMLSyntaxError as error:
         raise UrdfError(source, f"is not well-formed XML: {error}") from error
+    if root.getroottree().docinfo.doctype:
+        raise UrdfError(source, "has a DOCTYPE, which a URDF has no use for")
+    if any(isinstance(item.tag, str) and "xacro" in item.tag for item in root.iter()):
+        raise UrdfError(source, "is xacro, not URDF: expand it with the xacro tool first")
     if root.tag != "robot":
         raise UrdfError(source, f"is not a URDF: its root element is <{root.tag}>, not <robot>")
     if "name" not in root.attrib:
         raise UrdfError(source, "<robot> has no name")
     try:
-        urdf = yourdfpy.URDF.load(BytesIO(data), build_scene_graph=False, load_meshes=False)
+        urdf = yourdfpy.URDF.load(BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False)
     except (KeyError, ValueError, AttributeError, IndexError, TypeError) as error:
         raise UrdfError(source, f"is malformed: {type(error).__name__}: {error}") from error
     return urdf.robot, str(etree.tostring(root, encoding="unicode"))
@@ -95,7 +103,7 @@ def _joint(parsed: Any, source: str) -> Joint:
     origin = np.eye(4) if parsed.origin is None else np.asarray(parsed.origin, dtype=np.float64)
     axis = np.asarray(parsed.axis, dtype=np.float64)
     length = float(np.linalg.norm(axis))
-    if not np.isfinite(origin).all() or axis.shape != (3,) or not np.isfinite(length):
+    if not (np.abs(origin) < _FARTHEST).all() or axis.shape != (3,) or not np.isfinite(length):
         raise UrdfError(source, f"{where}: its origin or axis is not finite")
     if length < 1e-9:
         if parsed.type != "fixed":
@@ -199,7 +207,7 @@ def _shapes(parsed: Sequence[Any], link: str, source: str) -> tuple[Shape, ...]:
             valid = f"{wanted} finite values, {'not zero' if kind == 'mesh' else 'positive'}"
             raise UrdfError(source, f"link '{link}' has a {kind} of size {size}; valid: {valid}")
         origin = np.eye(4) if item.origin is None else np.asarray(item.origin, dtype=np.float64)
-        if not np.isfinite(origin).all():
+        if not (np.abs(origin) < _FARTHEST).all():
             raise UrdfError(source, f"link '{link}' has a {kind} whose origin is not finite")
         filename = geometry.mesh.filename if kind == "mesh" else None
         shapes.append(Shape(kind, origin, size, filename))

@@ -219,8 +219,10 @@ class Robot:
         """Configurations (*batch, n) as contiguous columns (n, N) in the robot's dtype, on its device.
 
         Raises:
-            ParameterError: The last axis is not n.
+            ParameterError: It is no real tensor, or its last axis is not n.
         """
+        if not isinstance(q, Tensor) or q.is_complex():
+            raise ParameterError("configuration", type(q).__name__, "a real torch tensor")
         if q.ndim == 0 or q.shape[-1] != self.n:
             raise ParameterError("configuration shape", tuple(q.shape), f"(*batch, {self.n})")
         return q.to(device=self.device, dtype=self.dtype).reshape(-1, self.n).T.contiguous()

@@ -92,7 +92,7 @@ class SphereModel:
 
         try:
             data = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, ValueError, OverflowError) as error:
             raise FileFormatError(source, f"is not YAML: {' '.join(str(error).split())}") from error
         for outer in ("robot_cfg", "kinematics"):  # cuRobo nests both entries in these
             if isinstance(data, dict) and outer in data:
@@ -136,7 +136,7 @@ def _spheres(source: str, link: str, items: Any) -> tuple[Sphere, ...]:
         try:
             x, y, z = map(float, item["center"])
             radius = float(item["radius"])
-        except (TypeError, KeyError, ValueError) as error:
+        except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise FileFormatError(
                 source, f"link '{link}': got {item}; valid: {{center: [x, y, z], radius: r}}"
             ) from error

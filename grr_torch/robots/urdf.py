@@ -140,10 +140,14 @@ class Urdf:
         Raises:
             MeshNotFoundError: It is in none of these places.
         """
-        candidates = self._mesh_candidates(filename)
-        for candidate in candidates:
-            if candidate.is_file():
-                return candidate
+        candidates: list[Path] = []
+        try:
+            candidates = self._mesh_candidates(filename)
+            for candidate in candidates:
+                if candidate.is_file():
+                    return candidate
+        except (OSError, ValueError):  # no name that a file could have
+            pass
         raise MeshNotFoundError(filename, link, candidates)
 
     def _mesh_candidates(self, filename: str) -> list[Path]:

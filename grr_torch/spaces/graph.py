@@ -17,6 +17,8 @@ from grr_torch.errors import ParameterError
 
 Bounds = Sequence[tuple[float, float]]
 
+# metres beyond which a bound is a mistake
+_FARTHEST = 1e6
 # neighbour tables of a larger graph would not fit a laptop
 _MOST_POINTS = 2_000_000
 
@@ -85,9 +87,9 @@ def check_bounds(bounds: Bounds) -> tuple[tuple[float, float], ...]:
     valid = "two or three intervals, low < high, finite, in metres"
     try:
         pairs = tuple((float(low), float(high)) for low, high in bounds)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ParameterError("bounds", bounds, valid) from error
-    if len(pairs) not in (2, 3) or not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in pairs):
+    if len(pairs) not in (2, 3) or not all(-_FARTHEST <= a < b <= _FARTHEST for a, b in pairs):
         raise ParameterError("bounds", pairs, valid)
     return pairs
 
@@ -98,9 +100,9 @@ def check_count(points: int) -> int:
     Raises:
         ParameterError: It is below 1 or beyond what could be held.
     """
-    if isinstance(points, bool) or not isinstance(points, int) or not 1 <= points <= _MOST_POINTS:
+    if isinstance(points, bool) or not hasattr(points, "__index__") or not 1 <= points <= _MOST_POINTS:
         raise ParameterError("points", points, f"a whole number from 1 to {_MOST_POINTS:,}")
-    return points
+    return int(points)
 
 
 def staggered_grid(bounds: Bounds, n: int) -> TaskGraph:

@@ -43,7 +43,7 @@ class TaskSpace(ABC):
     kind: ClassVar[str]
 
     def __post_init__(self) -> None:
-        if self.dimension not in (2, 3):
+        if not isinstance(self.dimension, int) or self.dimension not in (2, 3):
             raise ParameterError("task dimension", self.dimension, "2 or 3")
 
     @property
@@ -169,8 +169,8 @@ class FixedRotation(TaskSpace):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.rpy) != 3 or not all(map(math.isfinite, self.rpy)):
-            raise ParameterError("rotation", self.rpy, "three finite angles: roll, pitch, yaw [rad]")
+        if len(self.rpy) != 3 or not all(abs(angle) <= 2.0 * math.pi for angle in self.rpy):
+            raise ParameterError("rotation", self.rpy, "roll, pitch, yaw in radians, each within a full turn")
         if self.dimension == 2 and any(abs(angle) > 1e-9 for angle in self.rpy[:2]):
             raise ParameterError("rotation", self.rpy, "roll and pitch 0 for a task in the plane")
 
