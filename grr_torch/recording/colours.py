@@ -8,10 +8,11 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Colours = npt.NDArray[np.uint8]
 
-CONNECTED = (120, 140, 165, 60)
+CONNECTED = (58, 66, 78, 255)
 BROKEN = (235, 70, 50, 255)
 UNRESOLVED = (255, 176, 0, 255)
-GRID = (90, 95, 105, 28)
+GRID = (40, 43, 50, 255)
+TOUR = (235, 235, 235, 255)
 
 # dark blue over green to yellow, of about even steps in lightness
 _SCALE = np.array([[59, 28, 92], [52, 94, 141], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64)

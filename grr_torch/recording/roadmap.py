@@ -96,10 +96,9 @@ def _log_map(recording: Any, roadmap: Roadmap) -> None:
     edges = roadmap.edges.numpy()
     connected = roadmap.connected.numpy()
     broken = ~connected & resolved[edges].all(1)
-    thin = 0.1 * radius
-    log("connected", rr.LineStrips3D(points[edges[connected]], colors=colours.CONNECTED, radii=thin))
-    log("broken", rr.LineStrips3D(points[edges[broken]], colors=colours.BROKEN, radii=4.0 * thin))
-    log("grid", rr.LineStrips3D(points[edges], colors=colours.GRID, radii=0.5 * thin))
+    log("connected", rr.LineStrips3D(points[edges[connected]], colors=colours.CONNECTED, radii=_line(0.4)))
+    log("broken", rr.LineStrips3D(points[edges[broken]], colors=colours.BROKEN, radii=_line(1.6)))
+    log("grid", rr.LineStrips3D(points[edges], colors=colours.GRID, radii=_line(0.25)))
     if roadmap.reachable is not None:
         left = (roadmap.reachable & ~roadmap.resolved).numpy()
         log("unresolved", rr.Points3D(points[left], colors=colours.UNRESOLVED, radii=1.6 * radius))
@@ -125,7 +124,7 @@ def _log_waves(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
         shade = np.where((wave[done] == step)[:, None], (255, 176, 0), (90, 150, 200)).astype(np.uint8)
         recording.log("expansion/vertices", rr.Points3D(points[done], colors=shade, radii=radius))
         lines = points[edges[edge_wave <= step]]
-        recording.log("expansion/edges", rr.LineStrips3D(lines, colors=colours.CONNECTED, radii=0.1 * radius))
+        recording.log("expansion/edges", rr.LineStrips3D(lines, colors=colours.CONNECTED, radii=_line(0.4)))
         latest.append(int(np.flatnonzero(wave == step)[0]) if (wave == step).any() else latest[-1])
     recording.reset_time()
     robot.animate(rr.TimeColumn(WAVE, sequence=range(len(latest))), roadmap.configurations[latest].numpy())
@@ -148,7 +147,7 @@ def _log_tour(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
     recording.log(
         "tour/path",
         rr.CoordinateFrame(roadmap.robot.base),
-        rr.LineStrips3D([trace], colors=(255, 255, 255, 150), radii=0.25 * _radius(roadmap)),
+        rr.LineStrips3D([trace], colors=colours.TOUR, radii=_line(1.0)),
         static=True,
     )
     recording.log("tour/tool", rr.CoordinateFrame(roadmap.robot.base), static=True)
@@ -203,8 +202,8 @@ def _camera(roadmap: Roadmap) -> Any:
     centre = 0.5 * (points.min(0) + points.max(0))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     flat = roadmap.task.dimension == 2
-    direction = np.array([0.0, -0.02, 1.0]) if flat else np.array([0.75, -0.75, 0.45])
-    eye = centre + (0.85 if flat else 0.95) * size * direction / np.linalg.norm(direction)
+    direction = np.array([0.0, -0.02, 1.0]) if flat else np.array([0.9, -0.42, 0.42])
+    eye = centre + (0.85 if flat else 0.8) * size * direction / np.linalg.norm(direction)
     return rrb.EyeControls3D(position=eye, look_target=centre, eye_up=(0, 1, 0) if flat else (0, 0, 1))
 
 
@@ -216,6 +215,14 @@ def _in_space(points: np.ndarray) -> np.ndarray:
 
 
 def _radius(roadmap: Roadmap) -> float:
-    """Radius [m] of a vertex as it is drawn: an eighth of the median edge."""
+    """Radius [m] of a vertex as it is drawn: small enough in space that the arm is seen between them."""
     a, b = roadmap.points[roadmap.edges].unbind(1)
-    return 0.125 * float((a - b).norm(dim=1).median()) if len(a) else 0.01
+    share = 0.125 if roadmap.task.dimension == 2 else 0.05
+    return share * float((a - b).norm(dim=1).median()) if len(a) else 0.01
+
+
+def _line(width: float) -> Any:
+    """Width of a line in points of the screen, so that edges stay thin from near and far."""
+    import rerun as rr
+
+    return rr.components.Radius.ui_points(width)
