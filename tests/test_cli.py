@@ -224,7 +224,14 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(tmp_path, words, complaint)
 
 def test_ctrl_c_leaves_no_file(tmp_path):
     words = ["build", "--robot", "kinova", "--points", "200000"]
-    process = subprocess.Popen([*PROGRAM, *words], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*PROGRAM, *words],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        # a shell's background jobs ignore the signal, and so would their children
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     time.sleep(9)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
@@ -241,11 +248,11 @@ def test_help_has_an_example(tmp_path, command):
     assert not command or "Example:" in result.stdout
 
 
-def test_help_imports_nothing_heavy():
+def test_help_imports_nothing_heavy(tmp_path):
     code = (
         "import sys, grr_torch.cli.main; print([m for m in ('torch', 'numpy', 'rerun', 'trimesh') if m in sys.modules])"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 
 

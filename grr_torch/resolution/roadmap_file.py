@@ -123,7 +123,8 @@ def read_file(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, T
             if version != FORMAT_VERSION:
                 raise FileFormatError(path, f"is of format version {version}; this version reads {FORMAT_VERSION}")
             metadata = {key: json.loads(value) for key, value in header.items()}
-            return metadata, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            names = list(file.keys())
+            return metadata, {name: file.get_tensor(name) for name in names}
     except SafetensorError as error:
         raise FileFormatError(path, f"is truncated or not a roadmap: {error}") from error
     except (json.JSONDecodeError, OSError) as error:

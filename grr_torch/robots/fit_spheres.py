@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 # spheres a link, unless told otherwise
 DEFAULT_COUNT = 16
+# added to every radius [m], for what lies between the sampled points
+_SPARE = 5e-5
 # spheres are written with this many decimals [m]; radii are rounded up
 _DECIMALS = 5
 
@@ -116,7 +118,7 @@ def _fit_link(meshes: list[Trimesh], count: int | None, tolerance: float | None,
         chosen, tolerance = _least_tolerance(distances, depths, count, size)
         while len(chosen) < min(count, len(candidates)):  # spheres the cover had no need of, put where there is room
             chosen.append(int(cdist(candidates, candidates[chosen]).min(1).argmax()))
-    dense = [surface_points(meshes, _spacing(size) / 2.0, seed + k) for k in (1, 2, 3)]
+    dense = [surface_points(meshes, _spacing(size) / 2.0, seed + k) for k in (1, 2, 3, 4)]
     covers = [(candidates[chosen], depths[chosen] + tolerance)]
     rng = np.random.default_rng(seed)
     for start in range(starts):
@@ -124,16 +126,20 @@ def _fit_link(meshes: list[Trimesh], count: int | None, tolerance: float | None,
         centres, radii = covers[0]
         moved = centres + rng.normal(scale=0.008 * size * start, size=centres.shape)
         covers.append(tighten(moved, radii, solid, inner, size, seed + start))
-    fits = [measure(_closed(*cover, targets, dense[0], dense[1]), solid, dense[2]) for cover in covers]
+    fits = [measure(_closed(*cover, targets, dense[:2], dense[2]), solid, dense[3]) for cover in covers]
     return min(fits, key=lambda fit: fit.mean_excess + 0.1 * fit.max_excess)
 
 
-def _closed(centres: Points, radii: Points, targets: Points, surface: Points, check: Points) -> tuple[Sphere, ...]:
+def _closed(
+    centres: Points, radii: Points, targets: Points, surfaces: list[Points], check: Points
+) -> tuple[Sphere, ...]:
     """Spheres resized until no point of the geometry is outside, and rounded."""
     centres = np.round(centres, _DECIMALS)
-    radii = _grown(centres, _shrunk(centres, radii, targets), surface)
-    # what another sample finds outside bounds what lies between the points
-    radii = radii + _outside(check, centres, radii)
+    radii = _shrunk(centres, radii, targets)
+    for surface in surfaces:
+        radii = _grown(centres, radii, surface)
+    # what another sample finds outside tells what lies between the points
+    radii = radii + _outside(check, centres, radii) + _SPARE
     radii = np.ceil(radii * 10**_DECIMALS) / 10**_DECIMALS
     # a sphere inside another one adds nothing; of equal ones the first stays
     hidden = cdist(centres, centres) + radii[:, None] <= radii
