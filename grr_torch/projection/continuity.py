@@ -10,7 +10,7 @@ from torch import Tensor
 from grr_torch.errors import ParameterError
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, point_columns, project_columns
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.configuration import distance, interpolate
+from grr_torch.spaces.configuration import difference, interpolate
 from grr_torch.spaces.task import TaskSpace
 
 # with c > 1 the recursion need not end: what is unfinished at this depth is broken
@@ -60,8 +60,8 @@ def is_continuous(
         raise ParameterError("c", c, "above 0.5")
     if not 0.0 < epsilon < math.inf:
         raise ParameterError("epsilon", epsilon, "above 0")
-    p = (point_columns(robot, task, points_a).T, point_columns(robot, task, points_b).T)
-    q = (robot.columns(configurations_a).T, robot.columns(configurations_b).T)
+    p = (point_columns(robot, task, points_a), point_columns(robot, task, points_b))
+    q = (robot.columns(configurations_a), robot.columns(configurations_b))
     batch = points_a.shape[:-1]
     if any(part.shape[:-1] != batch for part in (points_b, configurations_a, configurations_b)):
         shapes = tuple(tuple(part.shape) for part in (points_a, points_b, configurations_a, configurations_b))
@@ -80,28 +80,39 @@ def _check(
     epsilon: float,
     tolerances: Tolerances,
 ) -> Tensor:
-    continuous = torch.ones(len(q[0]), dtype=torch.bool, device=q[0].device)
+    """`is_continuous` (N,) for columns: points (width, N) and configurations (n, N). One projection a bisection."""
+    wraps = robot.continuous[:, None]
     (pa, pb), (qa, qb) = p, q
-    edge = torch.arange(len(qa), device=qa.device)
+    continuous = torch.ones(qa.shape[1], dtype=torch.bool, device=qa.device)
+    edge = torch.arange(qa.shape[1], device=qa.device)
+    length = _length(qa, qb, wraps)
     for _ in range(_DEPTH):
-        length = distance(qa, qb, robot.continuous)
-        pm = task.interpolate(pa, pb, 0.5)
-        bisect = interpolate(qa, qb, 0.5, robot.continuous)
-        solved, valid = project_columns(robot, task, pm.T, bisect.T, tolerances)
-        qm = solved.T
-        deviation = torch.maximum(distance(qa, qm, robot.continuous), distance(qm, qb, robot.continuous))
+        pm = task.interpolate(pa.T, pb.T, 0.5).T
+        qm, valid = project_columns(robot, task, pm, interpolate(qa, qb, 0.5, wraps), tolerances)
+        first, second = _length(qa, qm, wraps), _length(qm, qb, wraps)
         long = length >= epsilon
-        broken = ~valid | (long & ~(deviation <= c * length))
+        broken = ~valid | (long & ~(torch.maximum(first, second) <= c * length))
         continuous[edge[broken]] = False
         # halves that are still long, of edges that are still whole
-        edge, long = torch.cat([edge, edge]), torch.cat([long, long])
-        pa, pb = torch.cat([pa, pm]), torch.cat([pm, pb])
-        qa, qb = torch.cat([qa, qm]), torch.cat([qm, qb])
-        continuous[edge.bincount(minlength=len(continuous)) > _PIECES] = False
-        split = long & continuous[edge]
-        split[split.clone()] = distance(qa[split], qb[split], robot.continuous) >= epsilon
-        if not bool(split.any()):
+        going_on = long & continuous[edge]
+        split = torch.cat([going_on & (first >= epsilon), going_on & (second >= epsilon)])
+        edge = torch.cat([edge, edge])
+        if bool((edge.bincount(minlength=len(continuous)) > _PIECES).any()):
+            continuous[edge.bincount(minlength=len(continuous)) > _PIECES] = False
+            split &= continuous[edge]
+        left = split.nonzero()[:, 0]
+        if len(left) == 0:
             return continuous
-        edge, pa, pb, qa, qb = edge[split], pa[split], pb[split], qa[split], qb[split]
+        edge, length = edge[left], torch.cat([first, second])[left]
+        pa, pb, qa, qb = (_halves(*pair, left) for pair in ((pa, pm), (pm, pb), (qa, qm), (qm, qb)))
     continuous[edge] = False
     return continuous
+
+
+def _length(start: Tensor, end: Tensor, wraps: Tensor) -> Tensor:
+    """D_q (N,) of columns."""
+    return difference(start, end, wraps).square().sum(0).sqrt()
+
+
+def _halves(first: Tensor, second: Tensor, left: Tensor) -> Tensor:
+    return torch.cat([first, second], dim=1).index_select(1, left)

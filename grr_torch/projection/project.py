@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
+from grr_torch.pieces import in_pieces
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import normalise
@@ -21,13 +22,15 @@ from grr_torch.spaces.task import TaskSpace
 _ROTATION_LENGTH = 0.3
 # longest step of a joint [rad or m]
 _LONGEST_STEP = 0.5
+# a step shorter than this [rad or m], with an error left, is one from a stationary point
+_SHORTEST_STEP = 1e-9
 # λ = _DAMPING · ½‖e‖² + _LEAST_DAMPING
 _DAMPING = 0.1
 _LEAST_DAMPING = 1e-7
 # a configuration is given up when its error has not fallen by a tenth in so many iterations
-_PATIENCE = 8
-# configurations that are iterated together: their Jacobians should stay in the cache
-_COLUMNS_AT_ONCE = 4096
+_PATIENCE = 4
+# columns that are done leave the batch when so many are left of it
+_LEFT = 0.75
 
 
 @dataclass(frozen=True)
@@ -116,94 +119,121 @@ def project_columns(
     check_collision: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """`project` for columns: targets (width, N) and guesses (n, N) give configurations (n, N) and valid (N,)."""
-    with torch.no_grad():
-        parts = [
-            _project(robot, task, target, guess, tolerances)
-            for target, guess in zip(
-                targets.split(_COLUMNS_AT_ONCE, dim=1), q.split(_COLUMNS_AT_ONCE, dim=1), strict=True
-            )
-        ]
-        solved = normalise(torch.cat([part[0] for part in parts], dim=1), robot.continuous[:, None])
-        valid = torch.cat([part[1] for part in parts])
+
+    def solve(targets: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+        solved, valid = _project(robot, task, targets, q, tolerances)
+        solved = normalise(solved, robot.continuous[:, None])
         if check_collision and robot.spheres is not None:
             converged = valid.nonzero()[:, 0]
-            valid[converged] = ~robot.columns_in_self_collision(solved[:, converged])
+            hit = robot.columns_in_self_collision(_take(solved, converged))
+            valid[converged[hit]] = False
         return torch.where(valid, solved, torch.nan), valid
+
+    with torch.no_grad():
+        solved, valid = in_pieces(solve, targets, q)
+    return solved, valid
 
 
 def _project(
     robot: Robot, task: TaskSpace, targets: Tensor, q: Tensor, tolerances: Tolerances
 ) -> tuple[Tensor, Tensor]:
-    lower, upper = robot.lower[:, None], robot.upper[:, None]
-    limited = bool(robot.lower.isfinite().any() | robot.upper.isfinite().any())
-    q = q.clamp(lower, upper) if limited else q
+    """Configurations (n, N), NaN where not converged, and converged (N,).
+
+    What has converged stays in the batch, at no harm to itself, until it is a good part of it: to copy the rest each
+    time costs more.
+    """
+    limits = _limits(robot)
+    q = q if limits is None else q.clamp(*limits)
     solved = torch.full_like(q, torch.nan)
     valid = torch.zeros(q.shape[1], dtype=torch.bool, device=q.device)
     active = torch.arange(q.shape[1], device=q.device)
-    best = torch.full_like(q[0], torch.inf)
-    waited = torch.zeros_like(active)
-    weights = torch.ones(task.constraints, 1, dtype=q.dtype, device=q.device)
-    weights[task.dimension :] = _ROTATION_LENGTH
+    waiting = torch.ones_like(valid)
+    best = last_best = torch.full_like(q[0], torch.inf)
+    rows = task.dimension
     for iteration in range(tolerances.iterations + 1):
         frames = robot.tree.frames(q)
-        position, rotation = robot.tree.tool_pose(frames)
-        error = task.error(targets, position, rotation)
-        translation_left, rotation_left = task.residuals(error)
-        done = (translation_left <= tolerances.position) & (rotation_left <= tolerances.rotation)
-        error = error * weights
-        size = error.square().sum(0)
-        improved = size < 0.81 * best
-        waited = torch.where(improved, 0, waited + 1)
-        best = torch.where(improved, size, best)
-        keep = ~(done | (waited > _PATIENCE))
-        if iteration == tolerances.iterations or not bool(keep.all()):
-            finished = active[done]
-            solved[:, finished] = q[:, done]
-            valid[finished] = True
-            kept = keep.nonzero()[:, 0]
-            if iteration == tolerances.iterations or len(kept) == 0:
-                break
-            active, targets, q, error = active[kept], _take(targets, kept), _take(q, kept), _take(error, kept)
-            best, waited, size, position = best[kept], waited[kept], size[kept], _take(position, kept)
-            frames = [type(frame)(frame.xy[..., kept], frame.zp[..., kept]) for frame in frames]
-        jacobian = task.jacobian(robot.tree.jacobian(frames, position)) * weights[:, None]
-        damping = _DAMPING * 0.5 * size + _LEAST_DAMPING
-        step = damped_least_squares(jacobian, error, damping)
-        stuck = (jacobian * error[:, None]).sum(0).abs().amax(0) < 1e-9 * size.sqrt()
-        if bool(stuck.any()):
-            # at a stationary point, such as a straight arm, any direction may lead on
-            step = torch.where(stuck, _nudge(q), step)
-        step = step * (_LONGEST_STEP / step.abs().amax(0).clamp_min(_LONGEST_STEP))
-        if limited:
-            step = _keep_limits(step, q, jacobian, error, damping, lower, upper)
-        q = q + step
-        if limited:
-            q = q.clamp(lower, upper)  # rounding only: the step keeps the limits
+        error = task.error(targets, *robot.tree.tool_pose(frames))
+        squared = error.square()
+        translation, rotation = squared[:rows].sum(0), squared[rows:].sum(0)
+        done = (translation <= tolerances.position**2) & (rotation <= tolerances.rotation**2)
+        size = translation.add_(rotation, alpha=_ROTATION_LENGTH**2)
+        best = torch.minimum(best, size)
+        finished = (waiting & done).nonzero()[:, 0]
+        if len(finished):
+            rank = active[finished]
+            solved[:, rank], valid[rank] = _take(q, finished), True
+            waiting = waiting & ~done
+        if iteration % _PATIENCE == 0:
+            waiting = waiting & (best < 0.81 * last_best)
+            last_best = best
+        left = waiting.nonzero()[:, 0]
+        if len(left) == 0 or iteration == tolerances.iterations:
+            break
+        if len(left) < _LEFT * len(waiting):
+            active, targets, q, error = active[left], _take(targets, left), _take(q, left), _take(error, left)
+            best, last_best, size, frames = best[left], last_best[left], size[left], frames[..., left]
+            waiting = torch.ones_like(active, dtype=torch.bool)
+        jacobian = task.jacobian(robot.tree.jacobian(frames))
+        if len(error) > rows:
+            error[rows:].mul_(_ROTATION_LENGTH)
+            jacobian[rows:].mul_(_ROTATION_LENGTH)
+        q = _step(q, jacobian, error, size.mul(0.5 * _DAMPING).add_(_LEAST_DAMPING), limits)
     return solved, valid
 
 
-def _keep_limits(
-    step: Tensor, q: Tensor, jacobian: Tensor, error: Tensor, damping: Tensor, lower: Tensor, upper: Tensor
+def _step(
+    q: Tensor, jacobian: Tensor, error: Tensor, damping: Tensor, limits: tuple[Tensor, Tensor] | None
 ) -> Tensor:
-    """Steps that stay within limits: joints that would leave stop there, the others are solved for again."""
-    beyond = (q + step < lower) | (q + step > upper)
-    columns = beyond.any(0).nonzero()[:, 0]
-    if len(columns) == 0:
-        return step
-    part, stopped = step[:, columns], beyond[:, columns]
-    q, jacobian, error, damping = q[:, columns], jacobian[:, :, columns], error[:, columns], damping[columns]
-    for _ in range(len(part)):
-        held = torch.where(stopped, (q + part).clamp(lower, upper) - q, 0.0)
+    """Configurations after one step, within limits."""
+    step = damped_least_squares(jacobian, error, damping)
+    longest = step.abs().amax(0)
+    stuck = longest < _SHORTEST_STEP
+    if bool(stuck.any()):
+        # at a stationary point, such as a straight arm, any direction may lead on
+        step = torch.where(stuck, _nudge(q), step)
+    moved = torch.addcmul(q, step, _LONGEST_STEP / longest.clamp_min(_LONGEST_STEP))
+    if limits is None:
+        return moved
+    kept = moved.clamp(*limits)
+    stopped = kept != moved
+    columns = stopped.any(0).nonzero()[:, 0]
+    if len(columns):
+        parts = (part[..., columns] for part in (q, kept, stopped, jacobian, error, damping))
+        kept[:, columns] = _stop_at_limits(*parts, limits)
+    return kept
+
+
+def _stop_at_limits(
+    q: Tensor,
+    kept: Tensor,
+    stopped: Tensor,
+    jacobian: Tensor,
+    error: Tensor,
+    damping: Tensor,
+    limits: tuple[Tensor, Tensor],
+) -> Tensor:
+    """Configurations after a step in which joints that would leave their range stop at its end, at `kept`.
+
+    The others make up for it: their step is solved for again, until no more of them would leave.
+    """
+    for _ in range(len(q)):
+        held = torch.where(stopped, kept - q, 0.0)
         rest = error - (jacobian * held).sum(1)
-        part = held + damped_least_squares(jacobian * ~stopped, rest, damping)
-        part = part * (_LONGEST_STEP / part.abs().amax(0).clamp_min(_LONGEST_STEP))
-        beyond = ((q + part < lower) | (q + part > upper)) & ~stopped
+        step = held + damped_least_squares(jacobian * ~stopped, rest, damping)
+        moved = torch.addcmul(q, step, _LONGEST_STEP / step.abs().amax(0).clamp_min(_LONGEST_STEP))
+        kept = moved.clamp(*limits)
+        beyond = (kept != moved) & ~stopped
         if not bool(beyond.any()):
             break
         stopped = stopped | beyond
-    step = step.clone()
-    step[:, columns] = (q + part).clamp(lower, upper) - q
-    return step
+    return kept
+
+
+def _limits(robot: Robot) -> tuple[Tensor, Tensor] | None:
+    """Limits (n, 1) as columns; None where no joint has any."""
+    if bool(robot.lower.isinf().all() & robot.upper.isinf().all()):
+        return None
+    return robot.lower[:, None], robot.upper[:, None]
 
 
 def _nudge(q: Tensor) -> Tensor:

@@ -73,9 +73,9 @@ def reach(robot: Robot) -> tuple[Tensor, float]:
     for index in tree.path:
         joint, mount = tree.joints[index], tree.mounts[index]
         if index != tree.path[0]:
-            radius += float(mount[5, :3].norm())
+            radius += float(mount[3, :3].norm())
         if not joint.revolute:
             ends = torch.stack([robot.lower[joint.dof], robot.upper[joint.dof]])
             radius += float((joint.multiplier * ends + joint.offset).abs().max())
-    radius += float(tree.links[tree.tool][1][:3, 3].norm())
-    return tree.mounts[tree.path[0]][5, :3].cpu(), radius
+    radius += float(tree.links[tree.tool][1][3, :3].norm())
+    return tree.mounts[tree.path[0]][3, :3].cpu(), radius

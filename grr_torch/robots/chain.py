@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from grr_torch.robots.kinematics import joint_motion
+from grr_torch.robots.compile_tree import joint_motion
 from grr_torch.robots.urdf import Joint, Urdf
 
 if TYPE_CHECKING:

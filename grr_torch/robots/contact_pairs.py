@@ -17,7 +17,8 @@ import torch
 from grr_torch.errors import ParameterError
 from grr_torch.progress import Progress, silent
 from grr_torch.robots.geometry import Points, link_meshes
-from grr_torch.robots.kinematics import KinematicTree, compile_tree, degrees_of_freedom
+from grr_torch.robots.compile_tree import compile_tree, degrees_of_freedom
+from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.spheres import Sphere, ordered_pair
 from grr_torch.robots.urdf import Urdf, sampling_range
 
@@ -160,10 +161,8 @@ def _random_poses(
     frames = tree.frames(q.T.contiguous())
     poses: dict[str, Points] = {}
     for link in links:
-        frame, pose = tree.links[link]
-        columns = frames[frame].place(pose.T.contiguous())
         matrix = np.tile(np.eye(4), (count, 1, 1))
-        matrix[:, :3] = columns.permute(2, 1, 0).numpy()
+        matrix[:, :3] = tree.link_pose(frames, link).permute(2, 1, 0).numpy()
         poses[link] = matrix
     return poses
 

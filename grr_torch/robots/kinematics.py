@@ -1,44 +1,23 @@
 """Poses and Jacobians of all links for many configurations at once, one configuration a column.
 
-A column layout, (n, N) in and (rows, …, N) out, makes every step an operation on long contiguous rows. Each
-moving joint gets a *frame*: its link's frame turned so that the joint's axis is the frame's z axis. A frame's
-pose is kept as two tensors, `xy` (its x and y axes) and `zp` (its z axis and its origin), each (2, 3, N), because
-turning about z touches only the first.
+A column layout, (n, N) in and (rows, …, N) out, makes every step an operation on long contiguous rows. Each moving
+joint gets a *frame*: its link's frame turned so that the joint's axis is the frame's z axis. Poses of all frames are
+one tensor (F, 4, 3, N): frame, its x, y, z axes and its origin, base coordinates, configuration. Behind the frames of
+the joints come the tool's and the base's.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from grr_torch.errors import UrdfError
-from grr_torch.robots.urdf import Joint, Matrix, Urdf
-
-
-class Frame(NamedTuple):
-    """Poses of one frame for N configurations, in the base frame.
-
-    Attributes:
-        xy: (2, 3, N) x and y axes.
-        zp: (2, 3, N) z axis and origin [m].
-    """
-
-    xy: Tensor
-    zp: Tensor
-
-    def place(self, points: Tensor) -> Tensor:
-        """Base-frame positions (S, 3, N) of points given as (S, 4) homogeneous coordinates in this frame."""
-        width = self.zp.shape[2]
-        placed = torch.addmm(
-            points[:, 2:] @ self.zp.reshape(2, 3 * width), points[:, :2], self.xy.reshape(2, 3 * width)
-        )
-        return placed.view(len(points), 3, width)
+# up to so many configurations the number of torch calls is the cost, not the arithmetic
+_FEW = 16
 
 
 @dataclass(frozen=True)
@@ -60,15 +39,16 @@ class MovingJoint:
     offset: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KinematicTree:
     """Constants of the forward kinematics of a robot's whole tree of links.
 
     Attributes:
         joints: The moving joints, parents first; joint i drives frame i.
-        mounts: For each joint (6, 4): rows that give x, y, y, −x, z and origin of its frame at value zero as
-            combinations of its parent frame's x, y, z and origin.
-        links: For each link: the frame it is fixed to (−1: the base), and its (4, 4) pose in that frame.
+        mounts: For each joint (4, 4): rows give x, y, z and origin of its frame at value zero as combinations of its
+            parent frame's x, y, z and origin.
+        links: For each link: the frame it is fixed to (−1: the base), and rows (4, 4) as in `mounts` that give its
+            own frame.
         tool: The link at the end of the chain.
         path: Frames from the base to the tool.
         n: Degrees of freedom.
@@ -81,60 +61,82 @@ class KinematicTree:
     path: tuple[int, ...]
     n: int
 
-    def frames(self, q: Tensor) -> list[Frame]:
-        """Poses of all frames for configurations q (n, N); the base is appended, so that index −1 finds it.
+    def frames(self, q: Tensor) -> Tensor:
+        """Poses (F, 4, 3, N) of all frames for configurations q (n, N); the last two are the tool and the base."""
+        if torch.is_grad_enabled() and q.requires_grad:
+            return _Frames.apply(q, self)  # type: ignore[no-any-return]
+        return self._frames_of_few(q) if q.shape[1] <= _FEW else self._frames_of_many(q)
 
-        About 70 multiply-adds a joint and configuration: a (6, 4) by (4, 3) product and the turn about z.
-        """
-        base = _identity(q)
-        angles = self._joint_values(q)
-        cosines, sines = angles.cos(), angles.sin()
-        frames: list[Frame] = []
-        width = q.shape[1]
-        for index, (joint, mount) in enumerate(zip(self.joints, self.mounts, strict=True)):
-            parent = base if joint.parent < 0 else frames[joint.parent]
-            at_zero = torch.addmm(
-                mount[:, 2:] @ parent.zp.reshape(2, 3 * width), mount[:, :2], parent.xy.reshape(2, 3 * width)
-            ).view(6, 3, width)
+    def _frames_of_many(self, q: Tensor) -> Tensor:
+        """Joint by joint, parents first: 84 multiply-adds a joint and configuration, four passes, in place."""
+        width, count = q.shape[1], len(self.joints)
+        values = self._joint_values(q)
+        cosines, sines = values.cos().unbind(0), values.sin().unbind(0)
+        frames, scratch = q.new_empty(count + 2, 4, 3, width), q.new_empty(6, 3, width)
+        frames[-1] = torch.eye(4, 3, dtype=q.dtype, device=q.device)[:, :, None]
+        flat, at_zero = frames.view(count + 2, 4, 3 * width).unbind(0), scratch.view(6, 3 * width)
+        turned, rest = (half.unbind(0) for half in frames.split(2, dim=1))
+        xy, yx, zp = scratch.split(2)
+        for index, (joint, mount) in enumerate(zip(self.joints, self._turning_mounts, strict=True)):
+            torch.mm(mount, flat[joint.parent], out=at_zero)
+            rest[index].copy_(zp)
             if joint.revolute:
                 # x' = c·x + s·y and y' = c·y − s·x, both at once
-                xy = torch.addcmul(at_zero[:2] * cosines[index], at_zero[2:4], sines[index])
-                frames.append(Frame(xy, at_zero[4:]))
+                torch.mul(xy, cosines[index], out=turned[index]).addcmul_(yx, sines[index])
             else:
-                moved = torch.stack([at_zero[4], torch.addcmul(at_zero[5], at_zero[4], angles[index])])
-                frames.append(Frame(at_zero[:2], moved))
-        frames.append(base)
+                turned[index].copy_(xy)
+                rest[index][1].addcmul_(zp[0], values[index])
+        index, mount = self.links[self.tool]
+        torch.mm(mount, flat[index], out=flat[-2])
         return frames
 
-    def tool_pose(self, frames: Sequence[Frame]) -> tuple[Tensor, Tensor]:
-        """Tool position (3, N) [m] and rotation (3, 3, N): second index counts the tool's axes."""
-        index, pose = self.links[self.tool]
-        columns = frames[index].place(pose.T.contiguous())
-        return columns[3], columns[:3].transpose(0, 1)
+    def _frames_of_few(self, q: Tensor) -> Tensor:
+        """All joints at once: product of each frame with its parent's, then with that product's parent's, and so on.
 
-    def jacobian(self, frames: Sequence[Frame], position: Tensor) -> Tensor:
-        """(6, n, N) geometric Jacobian of the tool at `position` (3, N): linear rows first, base frame.
-
-        Column of a revolute joint: (z × (p_tool − p), z); of a prismatic one: (z, 0).
+        64 multiply-adds a frame and round, ⌈log₂ of the depth⌉ rounds; two calls each, whatever the number of joints.
         """
-        path = self.path
-        axes = torch.stack([frames[i].zp[0] for i in path], dim=1)
-        arms = position[:, None] - torch.stack([frames[i].zp[1] for i in path], dim=1)
-        ax, ay, az = axes
-        rx, ry, rz = arms
+        fixed, along_cosine, along_sine = self._joint_matrices
+        values = self._joint_values(q).T
+        pad = (*values.shape[:-1], 2)
+        cosines, sines = values.cos(), values.sin()
+        if self._sliding is not None:
+            sines = torch.where(self._sliding, values, sines)
+        cosines, sines = (torch.cat([part, part.new_zeros(pad)], dim=-1)[..., None, None] for part in (cosines, sines))
+        poses = torch.addcmul(torch.addcmul(fixed, along_cosine, cosines), along_sine, sines)
+        for parents in self._ancestors:
+            poses = torch.matmul(poses, poses.index_select(1, parents))
+        return poses[..., :3].permute(1, 2, 3, 0)
+
+    def tool_pose(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Tool position (3, N) [m] and rotation (3, 3, N): second index counts the tool's axes."""
+        axes, position = frames[-2].split((3, 1))
+        return position[0], axes.transpose(0, 1)
+
+    def link_pose(self, frames: Tensor, link: str) -> Tensor:
+        """Pose (4, 3, N) of a link: rows x, y, z, origin."""
+        index, pose = self.links[link]
+        return place(frames[index], pose)
+
+    def jacobian(self, frames: Tensor) -> Tensor:
+        """(6, n, N) geometric Jacobian of the tool: linear rows first, base frame.
+
+        Column of a revolute joint: (z × (p_tool − p), z); of a prismatic one: (z, 0). 9 multiply-adds a column.
+        """
+        lines = frames[: len(self.path)] if self._plain_path else frames[list(self.path)]
+        _, axes, origins = lines.split((2, 1, 1), dim=1)
+        ax, ay, az = axes[:, 0].unbind(1)
+        rx, ry, rz = (frames[-2, 3] - origins[:, 0]).unbind(1)
         rows = torch.stack([ay * rz - az * ry, az * rx - ax * rz, ax * ry - ay * rx, ax, ay, az])
-        sliding = [k for k, i in enumerate(path) if not self.joints[i].revolute]
-        if sliding:
-            keep = torch.ones(len(path), 1, dtype=rows.dtype, device=rows.device)
-            keep[sliding] = 0.0
-            rows = rows * keep + torch.cat([axes, torch.zeros_like(axes)]) * (1.0 - keep)
-        dofs = [self.joints[i].dof for i in path]
-        if dofs == list(range(self.n)) and all(self.joints[i].multiplier == 1.0 for i in path):
+        if self._sliding is not None:
+            keep = torch.where(self._sliding[list(self.path)], 0.0, 1.0).to(rows)[:, None]
+            axis = rows[3:]
+            rows = rows * keep + torch.cat([axis, torch.zeros_like(axis)]) * (1.0 - keep)
+        if self._plain_path:
             return rows
-        # mimic joints: ∂/∂q sums over the joints that q drives
-        drive = rows.new_zeros(self.n, len(path))
-        for k, i in enumerate(path):
-            drive[dofs[k], k] = self.joints[i].multiplier
+        # ∂/∂q sums over the joints that q drives
+        drive = rows.new_zeros(self.n, len(self.path))
+        for k, i in enumerate(self.path):
+            drive[self.joints[i].dof, k] = self.joints[i].multiplier
         return torch.einsum("dk,rkN->rdN", drive, rows)
 
     def _joint_values(self, q: Tensor) -> Tensor:
@@ -146,117 +148,97 @@ class KinematicTree:
         shift = q.new_tensor([[joint.offset] for joint in self.joints])
         return values * scale + shift
 
+    def _joint_gradient(self, gradient: Tensor) -> Tensor:
+        """(n, N) from (J, N): each entry of q takes what its joints give."""
+        drive = gradient.new_zeros(self.n, len(self.joints))
+        for index, joint in enumerate(self.joints):
+            drive[joint.dof, index] = joint.multiplier
+        return drive @ gradient
 
-def _identity(q: Tensor) -> Frame:
-    width = q.shape[1]
-    axes = torch.eye(4, 3, dtype=q.dtype, device=q.device)
-    columns = axes[:, :, None].expand(4, 3, width).contiguous()
-    return Frame(columns[:2], columns[2:])
+    @cached_property
+    def _carried(self) -> Tensor:
+        """(J, F) ones where a frame moves with a joint."""
+        carried = torch.zeros(len(self.joints) + 2, len(self.joints) + 2)
+        for index, parent in enumerate([joint.parent for joint in self.joints] + [self.links[self.tool][0]]):
+            carried[:, index] = carried[:, parent]
+            carried[index, index] = 1.0
+        return carried[: len(self.joints)].to(self.mounts[0])
+
+    @cached_property
+    def _plain_path(self) -> bool:
+        """Whether frame i of the path is frame i of the tree and follows q[i]."""
+        figures = [(i, self.joints[i].dof, self.joints[i].multiplier) for i in self.path]
+        return figures == [(i, i, 1.0) for i in range(self.n)]
+
+    @cached_property
+    def _turning_mounts(self) -> tuple[Tensor, ...]:
+        """Mounts as (6, 4): rows x, y, y, −x, z, origin."""
+        return tuple(torch.stack([m[0], m[1], m[1], -m[0], m[2], m[3]]) for m in self.mounts)
+
+    @cached_property
+    def _sliding(self) -> Tensor | None:
+        """(J,) joints that slide; None if none does."""
+        sliding = [not joint.revolute for joint in self.joints]
+        return torch.tensor(sliding, device=self.mounts[0].device) if any(sliding) else None
+
+    @cached_property
+    def _joint_matrices(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(F, 4, 4) each: a frame in its parent's is the first plus cos θ times the second plus sin θ times the third.
+
+        Of a sliding joint, the value stands in place of the sine. Rows are as in `mounts`.
+        """
+        fixed, along_cosine, along_sine = (self.mounts[0].new_zeros(len(self.joints) + 2, 4, 4) for _ in range(3))
+        for index, (joint, mount) in enumerate(zip(self.joints, self.mounts, strict=True)):
+            fixed[index] = mount
+            if joint.revolute:
+                fixed[index, :2] = 0.0
+                along_cosine[index, :2] = mount[:2]
+                along_sine[index, :2] = torch.stack([mount[1], -mount[0]])
+            else:
+                along_sine[index, 3] = mount[2]
+        fixed[-2] = self.links[self.tool][1]
+        fixed[-1] = torch.eye(4)
+        return fixed, along_cosine, along_sine
+
+    @cached_property
+    def _ancestors(self) -> tuple[Tensor, ...]:
+        """(F,) each: the ancestor 1, 2, 4, … steps up of every frame; the base is its own."""
+        base = len(self.joints) + 1
+        up = [joint.parent % (base + 1) for joint in self.joints] + [self.links[self.tool][0] % (base + 1), base]
+        levels: list[Tensor] = []
+        while any(parent != base for parent in up):
+            levels.append(torch.tensor(up, device=self.mounts[0].device))
+            up = [up[parent] for parent in up]
+        return tuple(levels)
 
 
-def compile_tree(
-    urdf: Urdf,
-    path: Sequence[Joint],
-    base: str,
-    tool: str,
-    held: Mapping[str, float],
-    *,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> KinematicTree:
-    """Folds a URDF's fixed and held joints into constants.
+def place(frame: Tensor, points: Tensor) -> Tensor:
+    """Base-frame positions (S, 3, N) of points given as (S, 4) homogeneous coordinates in a frame (4, 3, N)."""
+    width = frame.shape[2]
+    return torch.mm(points, frame.reshape(4, 3 * width)).view(len(points), 3, width)
 
-    Args:
-        urdf: The robot.
-        path: Joints from `base` to `tool`.
-        base: Link in whose frame everything is expressed.
-        tool: Link at the end of the chain.
-        held: Values of joints that do not move [rad or m]; joints outside the chain that are not named stay at 0.
-        dtype: Of the constants.
-        device: Of the constants.
+
+class _Frames(torch.autograd.Function):
+    """`KinematicTree.frames` with its derivative by virtual work, itself differentiable.
+
+    A gradient on the axes and origins of a frame is a force and a moment on it; each joint answers for those on all
+    that it carries, along its axis.
     """
-    dofs = {joint.name: i for i, joint in enumerate(degrees_of_freedom(path, held))}
-    joints: list[MovingJoint] = []
-    mounts: list[Matrix] = []
-    to_base = np.eye(4)
-    for joint in urdf.path(urdf.root, base):
-        dof, _, offset = _drive(urdf, joint, dofs, held)
-        if dof is not None:
-            raise UrdfError(urdf.name, f"joint '{joint.name}' above base '{base}' mimics a joint of the chain")
-        to_base = to_base @ joint.origin @ joint_motion(joint, offset)
-    links: dict[str, tuple[int, Matrix]] = {urdf.root: (-1, np.asarray(np.linalg.inv(to_base), dtype=np.float64))}
-    waiting = list(urdf.joints.values())
-    while waiting:
-        joint = next(joint for joint in waiting if joint.parent in links)
-        waiting.remove(joint)
-        frame, pose = links[joint.parent]
-        dof, multiplier, offset = _drive(urdf, joint, dofs, held)
-        if dof is None:
-            links[joint.child] = (frame, pose @ joint.origin @ joint_motion(joint, offset))
-            continue
-        align = _align_z(joint.axis)
-        joints.append(MovingJoint(frame, joint.kind != "prismatic", dof, multiplier, offset))
-        mounts.append(pose @ joint.origin @ align)
-        links[joint.child] = (len(joints) - 1, align.T)
 
-    def constant(matrix: Matrix) -> Tensor:
-        return torch.tensor(matrix, dtype=dtype, device=device)
+    @staticmethod
+    def forward(ctx: Any, q: Tensor, tree: KinematicTree) -> Tensor:
+        frames = tree.frames(q)
+        ctx.tree = tree
+        ctx.save_for_backward(frames)
+        return frames
 
-    return KinematicTree(
-        joints=tuple(joints),
-        # rows x, y, y, −x, z, p of the frame at zero
-        mounts=tuple(constant((m.T)[[0, 1, 1, 0, 2, 3]] * [[1], [1], [1], [-1], [1], [1]]) for m in mounts),
-        links={link: (frame, constant(pose)) for link, (frame, pose) in links.items()},
-        tool=tool,
-        path=tuple(_frame_path(joints, links[tool][0])),
-        n=len(dofs),
-    )
-
-
-def degrees_of_freedom(path: Sequence[Joint], held: Mapping[str, float]) -> list[Joint]:
-    """The joints of a chain that a configuration has an entry for: movable, not held, not mimicking."""
-    return [joint for joint in path if joint.movable and joint.name not in held and joint.mimic is None]
-
-
-def _drive(
-    urdf: Urdf, joint: Joint, dofs: Mapping[str, int], held: Mapping[str, float]
-) -> tuple[int | None, float, float]:
-    """(dof, multiplier, offset) of a joint's value; dof None: constant at `offset`."""
-    if joint.name in dofs:
-        return dofs[joint.name], 1.0, 0.0
-    if joint.name in held or joint.mimic is None:
-        return None, 0.0, held.get(joint.name, 0.0)
-    source, multiplier, offset = joint.mimic
-    dof, inner, shift = _drive(urdf, urdf.joints[source], dofs, held)
-    return dof, multiplier * inner, multiplier * shift + offset
-
-
-def joint_motion(joint: Joint, value: float) -> Matrix:
-    """(4, 4) displacement of a joint at a constant value."""
-    motion = np.eye(4)
-    if joint.kind == "prismatic":
-        motion[:3, 3] = value * joint.axis
-    elif joint.movable:
-        x, y, z = joint.axis
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        motion[:3, :3] += math.sin(value) * cross + (1.0 - math.cos(value)) * cross @ cross
-    return motion
-
-
-def _align_z(axis: Matrix) -> Matrix:
-    """(4, 4) rotation whose z column is `axis`."""
-    z = axis
-    helper = np.eye(3)[int(np.argmin(np.abs(z)))]
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x)
-    align = np.eye(4)
-    align[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    return align
-
-
-def _frame_path(joints: Sequence[MovingJoint], frame: int) -> list[int]:
-    path: list[int] = []
-    while frame >= 0:
-        path.append(frame)
-        frame = joints[frame].parent
-    return path[::-1]
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        (frames,), (gradient,), tree = ctx.saved_tensors, gradients, ctx.tree
+        moments = torch.linalg.cross(frames, gradient, dim=2).sum(1)
+        moments, forces = (torch.einsum("jf,fkN->jkN", tree._carried, part) for part in (moments, gradient[:, 3]))
+        axes, origins = frames[:-2, 2], frames[:-2, 3]
+        turning = (axes * (moments - torch.linalg.cross(origins, forces, dim=1))).sum(1)
+        if tree._sliding is not None:
+            turning = torch.where(tree._sliding[:, None], (axes * forces).sum(1), turning)
+        return tree._joint_gradient(turning), None

@@ -13,7 +13,7 @@ import torch
 
 from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError, UrdfError
 from grr_torch.robots.chain import serial_chain
-from grr_torch.robots.kinematics import compile_tree, degrees_of_freedom
+from grr_torch.robots.compile_tree import compile_tree, degrees_of_freedom
 from grr_torch.robots.presets import Preset, load_preset, robot_names
 from grr_torch.robots.read_urdf import read_urdf
 from grr_torch.robots.robot import Robot

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
+from grr_torch.pieces import in_pieces
 from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.presets import Preset
 from grr_torch.robots.self_collision import SphereKernel
@@ -104,8 +105,7 @@ class Robot:
         Raises:
             ParameterError: The last axis is not n.
         """
-        columns = self.columns(q)
-        position, rotation = self.tree.tool_pose(self.tree.frames(columns))
+        position, rotation = in_pieces(lambda part: self.tree.tool_pose(self.tree.frames(part)), self.columns(q))
         return _rows(position, q), _rows(rotation, q)
 
     def jacobian(self, q: Tensor) -> Tensor:
@@ -131,9 +131,12 @@ class Robot:
         Raises:
             ParameterError: The last axis is not n.
         """
-        frames = self.tree.frames(self.columns(q))
-        position, rotation = self.tree.tool_pose(frames)
-        return _rows(position, q), _rows(rotation, q), _rows(self.tree.jacobian(frames, position), q)
+        position, rotation, jacobian = in_pieces(self._pose_and_jacobian, self.columns(q))
+        return _rows(position, q), _rows(rotation, q), _rows(jacobian, q)
+
+    def _pose_and_jacobian(self, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        frames = self.tree.frames(columns)
+        return *self.tree.tool_pose(frames), self.tree.jacobian(frames)
 
     def link_poses(self, q: Tensor) -> dict[str, Tensor]:
         """Poses T_base_link (*batch, 4, 4) of every link of the robot, also beside and beyond the chain.
@@ -144,14 +147,15 @@ class Robot:
         Raises:
             ParameterError: The last axis is not n.
         """
-        columns = self.columns(q)
-        frames = self.tree.frames(columns)
-        bottom = columns.new_tensor([0.0, 0.0, 0.0, 1.0])[:, None].expand(4, columns.shape[1])
-        poses: dict[str, Tensor] = {}
-        for link, (frame, pose) in self.tree.links.items():
-            placed = frames[frame].place(pose.T.contiguous()).transpose(0, 1)
-            poses[link] = _rows(torch.cat([placed, bottom[None]]), q)
-        return poses
+
+        def poses(columns: Tensor) -> tuple[Tensor, ...]:
+            frames = self.tree.frames(columns)
+            bottom = columns.new_tensor([0.0, 0.0, 0.0, 1.0])[None, :, None].expand(1, 4, columns.shape[1])
+            placed = (self.tree.link_pose(frames, link).transpose(0, 1) for link in self.tree.links)
+            return tuple(torch.cat([pose, bottom]) for pose in placed)
+
+        placed = in_pieces(poses, self.columns(q))
+        return {link: _rows(pose, q) for link, pose in zip(self.tree.links, placed, strict=True)}
 
     def self_collision_distance(self, q: Tensor) -> Tensor:
         """Signed distance (*batch,) [m] of the closest two links of the sphere model; negative in penetration.
@@ -164,10 +168,11 @@ class Robot:
         Raises:
             ParameterError: The last axis is not n.
         """
-        columns = self.columns(q)
-        if self._sphere_kernel is None:
+        columns, kernel = self.columns(q), self._sphere_kernel
+        if kernel is None:
             return columns.new_full(q.shape[:-1], math.inf)
-        return self._sphere_kernel.distance(self.tree.frames(columns)).reshape(q.shape[:-1])
+        (distances,) = in_pieces(lambda part: (kernel.distance(self.tree.frames(part)),), columns)
+        return distances.reshape(q.shape[:-1])
 
     def in_self_collision(self, q: Tensor) -> Tensor:
         """Whether two links are nearer than the margin: (*batch,) bool. False where there is no sphere model.
@@ -229,9 +234,10 @@ class Robot:
 
     def columns_in_self_collision(self, columns: Tensor) -> Tensor:
         """`in_self_collision` for columns (n, N): (N,) bool."""
-        if self._sphere_kernel is None:
+        kernel = self._sphere_kernel
+        if kernel is None:
             return torch.zeros(columns.shape[1], dtype=torch.bool, device=columns.device)
-        return self._sphere_kernel.collides(self.tree, columns, self.margin)
+        return in_pieces(lambda part: (kernel.collides(self.tree.frames(part), self.margin),), columns)[0]
 
     @cached_property
     def _sphere_kernel(self) -> SphereKernel | None:

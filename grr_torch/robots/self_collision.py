@@ -9,21 +9,38 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from grr_torch.robots.kinematics import Frame, KinematicTree
+from grr_torch.robots.kinematics import KinematicTree, place
 from grr_torch.robots.spheres import Sphere, SphereModel
 
 # sphere-pair distances held at once: they should stay in the cache
 _PAIRS_AT_ONCE = 1 << 17
-# configurations whose link poses are held at once
-_COLUMNS_AT_ONCE = 4096
 
 
-class _Body(NamedTuple):
-    """The spheres of one link: rows start … start + spheres of its frame's points; row `start` bounds them all."""
+class _Pair(NamedTuple):
+    """Two links that are checked against each other.
 
-    frame: int
-    start: int
-    spheres: int
+    Attributes:
+        first: (A, 5) rows −2x, −2y, −2z, |a|², 1 of the first link's spheres, in its frame.
+        second: (B, 4) homogeneous centres of the second link's spheres, in its frame [m].
+        reach: (A, B, 1) sums of radii [m].
+    """
+
+    first: Tensor
+    second: Tensor
+    reach: Tensor
+
+    def squared_distances(self, relative: Tensor) -> Iterator[tuple[slice, Tensor]]:
+        """Squared centre distances (A, B, M) for pieces of poses (4, 3, M) of the second frame in the first.
+
+        |a|² − 2 a·b + |b|² as one matrix product: 5 multiply-adds a pair of spheres.
+        """
+        at_once = max(1, _PAIRS_AT_ONCE // self.reach.numel())
+        for start in range(0, relative.shape[2], at_once):
+            part = relative[:, :, start : start + at_once]
+            b = place(part, self.second).transpose(0, 1)
+            rows = torch.cat([b, torch.ones_like(b[:1]), b.square().sum(0, keepdim=True)])
+            squared = torch.mm(self.first, rows.view(5, -1)).view(len(self.first), *b.shape[1:])
+            yield slice(start, start + b.shape[2]), squared
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,20 +48,22 @@ class SphereKernel:
     """Constants of a sphere model over a kinematic tree.
 
     Attributes:
-        points: For each frame that has spheres, (K, 4) homogeneous centres in that frame [m].
-        radii: For each frame that has spheres, (K, 1) radii [m].
-        bodies: The links that take part.
-        pairs: (2, P) indices into `bodies`: the pairs that are checked.
-        bounds: (P, 1) sums of the bounding radii of each pair [m].
-        cores: For each body the row of the sphere nearest to its bounding centre.
+        bounds: (L, 1, 4) homogeneous centres of spheres that hold all of a link's, in its frame [m].
+        cores: (L, 1, 4) and for each link the centre of the one of its spheres that is nearest to that.
+        frames: (L,) frame of each link.
+        pairs: (2, P) indices of the pairs of links that are checked.
+        bound_reach: (P, 1) sums of the bounding radii of each pair [m].
+        core_reach: (P, 1) sums of the core spheres' radii [m].
+        spheres: For each pair, its spheres.
     """
 
-    points: dict[int, Tensor]
-    radii: dict[int, Tensor]
-    bodies: tuple[_Body, ...]
-    pairs: Tensor
     bounds: Tensor
-    cores: tuple[int, ...]
+    cores: Tensor
+    frames: Tensor
+    pairs: Tensor
+    bound_reach: Tensor
+    core_reach: Tensor
+    spheres: tuple[_Pair, ...]
 
     @staticmethod
     def compile(model: SphereModel, tree: KinematicTree, like: Tensor) -> SphereKernel | None:
@@ -53,107 +72,89 @@ class SphereKernel:
         names = [link for link in model.spheres if any(link in pair for pair in pairs)]
         if not pairs:
             return None
-        points: dict[int, list[Tensor]] = {}
-        radii: dict[int, list[Tensor]] = {}
-        bodies: list[_Body] = []
-        cores: list[int] = []
+        centres: dict[str, Tensor] = {}
+        radii: dict[str, Tensor] = {}
+        cores: dict[str, int] = {}
         for link in names:
-            frame, pose = tree.links[link]
-            centres, sizes = _with_bound(model.spheres[link])
-            start = sum(map(len, points.setdefault(frame, [])))
-            points[frame].append(centres.to(pose) @ pose.T)
-            radii.setdefault(frame, []).append(sizes.to(pose))
-            bodies.append(_Body(frame, start, len(sizes) - 1))
-            cores.append(start + 1 + int((centres[1:] - centres[0]).norm(dim=1).argmin()))
-        index = like.new_tensor([[names.index(link) for link in side] for side in zip(*pairs, strict=True)])
-        bound = torch.stack([radii[body.frame][_position(bodies, body)][0] for body in bodies])
-        index = index.long()
+            local, sizes = _with_bound(model.spheres[link])
+            centres[link], radii[link] = local.to(like) @ tree.links[link][1], sizes.to(like)
+            cores[link] = 1 + int((local[1:] - local[0]).norm(dim=1).argmin())
+        index = torch.tensor([[names.index(link) for link in side] for side in zip(*pairs, strict=True)])
+        bound_radii = torch.stack([radii[link][0] for link in names])
+        core_radii = torch.stack([radii[link][cores[link]] for link in names])
+        index = index.to(like.device)
         return SphereKernel(
-            {frame: torch.cat(parts).contiguous() for frame, parts in points.items()},
-            {frame: torch.cat(parts)[:, None] for frame, parts in radii.items()},
-            tuple(bodies),
-            index,
-            (bound[index[0]] + bound[index[1]])[:, None],
-            tuple(cores),
+            bounds=torch.stack([centres[link][:1] for link in names]),
+            cores=torch.stack([centres[link][cores[link]][None] for link in names]),
+            frames=torch.tensor([tree.links[link][0] % (len(tree.joints) + 2) for link in names], device=like.device),
+            pairs=index,
+            bound_reach=bound_radii[index].sum(0)[:, None],
+            core_reach=core_radii[index].sum(0)[:, None],
+            spheres=tuple(_pair(centres, radii, *pair) for pair in pairs),
         )
 
-    def distance(self, frames: Sequence[Frame]) -> Tensor:
-        """Signed distance (N,) [m] of the closest checked pair of links.
+    def distance(self, frames: Tensor) -> Tensor:
+        """Signed distance (N,) [m] of the closest checked pair of links; NaN where a frame is.
 
         Pairs are skipped where their bounding spheres are farther apart than two of the robot's spheres are.
         """
-        centres = self._centres(frames)
         with torch.no_grad():
-            lower = self._bound_distances(centres)
-            cutoff = self._core_distances(centres).amin(0)
+            cutoff = (self._squared(frames, self.cores).sqrt() - self.core_reach).amin(0)
+            near = self._squared(frames, self.bounds).sqrt() - self.bound_reach <= cutoff
         columns: list[Tensor] = []
         distances: list[Tensor] = []
-        for pair, near in enumerate(lower <= cutoff):
-            for chunk, squared, reach in self._sphere_pairs(centres, pair, near.nonzero()[:, 0]):
-                columns.append(chunk)
+        for pair, chosen, relative in self._near(frames, near):
+            for part, squared in pair.squared_distances(relative):
+                columns.append(chosen[part])
                 # the floor keeps the gradient finite where two centres coincide
-                distances.append((squared.clamp_min(1e-24).sqrt() - reach).flatten(0, 1).amin(0))
-        result = torch.where(cutoff.isnan(), torch.nan, torch.inf).to(lower)
+                distances.append((squared.clamp_min(1e-24).sqrt() - pair.reach).flatten(0, 1).amin(0))
+        result = torch.where(cutoff.isnan(), torch.nan, torch.inf).to(frames)
         if not columns:
             return result
         return result.scatter_reduce(0, torch.cat(columns), torch.cat(distances), "amin")
 
-    def collides(self, tree: KinematicTree, q: Tensor, margin: float) -> Tensor:
-        """Whether any checked pair of links is nearer than `margin` [m]: (N,) bool for columns q (n, N)."""
-        return torch.cat([self._collides(tree.frames(part), margin) for part in q.split(_COLUMNS_AT_ONCE, dim=1)])
-
-    def _collides(self, frames: Sequence[Frame], margin: float) -> Tensor:
-        centres = self._centres(frames)
-        bound_distances = self._bound_distances(centres)
-        near_pairs = bound_distances < margin
-        hit = bound_distances.isnan().any(0)
-        for pair in near_pairs.any(1).nonzero()[:, 0].tolist():
-            near = (near_pairs[pair] & ~hit).nonzero()[:, 0]
-            for chunk, squared, reach in self._sphere_pairs(centres, pair, near):
-                hit[chunk] = (squared < (reach + margin) ** 2).flatten(0, 1).any(0)
+    def collides(self, frames: Tensor, margin: float) -> Tensor:
+        """Whether any checked pair of links is nearer than `margin` [m]: (N,) bool; true where a frame is NaN."""
+        near = ~(self._squared(frames, self.bounds) >= (self.bound_reach + margin).square())
+        hit = torch.zeros(frames.shape[3], dtype=torch.bool, device=frames.device)
+        for pair, chosen, relative in self._near(frames, near):
+            limit = (pair.reach + margin).square()
+            for part, squared in pair.squared_distances(relative):
+                hit[chosen[part]] |= ~(squared >= limit).flatten(0, 1).all(0)
         return hit
 
-    def _centres(self, frames: Sequence[Frame]) -> dict[int, Tensor]:
-        """Sphere centres (K, 3, N) of each frame."""
-        return {frame: frames[frame].place(points) for frame, points in self.points.items()}
+    def _squared(self, frames: Tensor, points: Tensor) -> Tensor:
+        """(P, N) squared distances of one point (L, 1, 4) of each link. 25 multiply-adds a link, 3 a pair."""
+        links, width = len(points), frames.shape[3]
+        poses = frames.index_select(0, self.frames).reshape(links, 4, 3 * width)
+        placed = torch.bmm(points, poses).view(links, 3, width)
+        first, second = (placed.index_select(0, side) for side in self.pairs)
+        return (first - second).square().sum(1)
 
-    def _bound_distances(self, centres: dict[int, Tensor]) -> Tensor:
-        """(P, N) distances [m] of the bounding spheres of each pair: never more than that of the spheres inside."""
-        bounds = torch.stack([centres[body.frame][body.start] for body in self.bodies])
-        return (bounds[self.pairs[0]] - bounds[self.pairs[1]]).norm(dim=1) - self.bounds
-
-    def _core_distances(self, centres: dict[int, Tensor]) -> Tensor:
-        """(P, N) distances [m] of one sphere of each link: never less than that of the pair."""
-        cores = torch.stack([centres[b.frame][core] for b, core in zip(self.bodies, self.cores, strict=True)])
-        radii = torch.stack([self.radii[b.frame][core] for b, core in zip(self.bodies, self.cores, strict=True)])
-        first, second = self.pairs
-        return (cores[first] - cores[second]).norm(dim=1) - (radii[first] + radii[second])
-
-    def _sphere_pairs(
-        self, centres: dict[int, Tensor], pair: int, columns: Tensor
-    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Columns, squared centre distances (A, B, M) and radius sums (A, B, 1) of one pair, in chunks."""
-        first, second = (self.bodies[int(side)] for side in self.pairs[:, pair])
-        rows_a, rows_b = _rows(first), _rows(second)
-        reach = self.radii[first.frame][rows_a][:, None] + self.radii[second.frame][rows_b]
-        for chunk in columns.split(max(1, _PAIRS_AT_ONCE // (first.spheres * second.spheres))):
-            if chunk.numel() == 0:
-                return
-            a = centres[first.frame][rows_a][:, :, chunk].unbind(1)
-            b = centres[second.frame][rows_b][:, :, chunk].unbind(1)
-            squared = (a[0][:, None] - b[0]).square()
-            for axis in (1, 2):
-                squared = squared + (a[axis][:, None] - b[axis]).square()
-            yield chunk, squared, reach
+    def _near(self, frames: Tensor, near: Tensor) -> Iterator[tuple[_Pair, Tensor, Tensor]]:
+        """Of each pair with a near column: its spheres, those columns (M,), and poses (4, 3, M), second in first."""
+        pairs, columns = near.nonzero().unbind(1)
+        first, second = (_take_poses(frames, self.frames[side][pairs], columns) for side in self.pairs)
+        # rows of the second frame, its origin relative to the first's, along the axes of the first: 36 multiply-adds
+        rows = torch.cat([second[:3], second[3:] - first[3:]])
+        relative = (rows[:, None] * first[:3]).sum(2)
+        counts = near.sum(1).tolist()
+        parts = zip(self.spheres, columns.split(counts), relative.split(counts, dim=2), strict=True)
+        return (part for part in parts if len(part[1]))
 
 
-def _rows(body: _Body) -> slice:
-    return slice(body.start + 1, body.start + 1 + body.spheres)
+def _take_poses(frames: Tensor, index: Tensor, columns: Tensor) -> Tensor:
+    """Poses (4, 3, M) of frame index[m] in column columns[m]."""
+    width = frames.shape[3]
+    entries = torch.arange(12, device=frames.device)[:, None] * width + (index * (12 * width) + columns)
+    return frames.reshape(-1)[entries].view(4, 3, -1)
 
 
-def _position(bodies: Sequence[_Body], body: _Body) -> int:
-    """How many bodies of the same frame come before this one."""
-    return sum(1 for other in bodies if other.frame == body.frame and other.start < body.start)
+def _pair(centres: dict[str, Tensor], radii: dict[str, Tensor], first: str, second: str) -> _Pair:
+    a = centres[first][1:, :3]
+    rows = torch.cat([-2.0 * a, a.square().sum(1, keepdim=True), torch.ones_like(a[:, :1])], dim=1)
+    reach = radii[first][1:, None] + radii[second][1:]
+    return _Pair(rows, centres[second][1:].contiguous(), reach[..., None])
 
 
 def _with_bound(spheres: Sequence[Sphere]) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,8 @@ from torch import Tensor
 
 def wrap(angle: Tensor) -> Tensor:
     """Angles in [−π, π] [rad]."""
-    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
+    turns = torch.round(angle * (0.5 / math.pi))
+    return torch.add(angle, turns, alpha=-2.0 * math.pi)
 
 
 def normalise(q: Tensor, continuous: Tensor) -> Tensor:
