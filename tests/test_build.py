@@ -13,7 +13,7 @@ from grr_torch.projection.project import project
 from grr_torch.resolution.expand import expand
 from grr_torch.resolution.reachability import reach
 from grr_torch.resolution.seeds import read_seeds
-from grr_torch.spaces.configuration import distance, weighted_average
+from grr_torch.spaces.configuration import average, distance, embed
 from grr_torch.spaces.graph import TaskGraph
 
 # reachable vertices and edges between them, as the arm's own shapes allow
@@ -88,8 +88,8 @@ def test_one_wave_is_the_projected_average_of_resolved_neighbours(planar_5):
     expansion = expand(planar_5, task, graph, q)
     d = (ends - middle).norm(dim=1)
     weights = (d.max() / d) ** 2
-    average = weighted_average(q, weights, planar_5.continuous)
-    expected, _ = project(planar_5, task, middle[0], average)
+    mean = average((weights[:, None] * embed(q, planar_5.continuous)).sum(0), planar_5.continuous)
+    expected, _ = project(planar_5, task, middle[0], mean)
     assert distance(expansion.configurations[2], expected, planar_5.continuous) < 1e-12
     assert expansion.wave.tolist() == [0, 0, 1]
 

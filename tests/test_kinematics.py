@@ -27,7 +27,8 @@ def load(tmp_path_factory, text, **options):
 @given(seed=st.integers(0, 10_000), joints=st.integers(1, 9))
 def test_agrees_with_pytorch_kinematics_on_random_robots(tmp_path_factory, seed, joints):
     robot = load(tmp_path_factory, random_urdf(np.random.default_rng(seed), joints), tool="tool")
-    q = robot.sample(17, torch.Generator().manual_seed(seed))
+    # few and many configurations are computed in different ways
+    q = robot.sample(3 if seed % 2 else 40, torch.Generator().manual_seed(seed))
     expected, matrix = robot.chain.jacobian(q, ret_eef_pose=True)
     position, rotation, jacobian = robot.pose_and_jacobian(q)
     torch.testing.assert_close(position, matrix[:, :3, 3], atol=1e-9, rtol=0)
@@ -116,6 +117,29 @@ def test_everything_is_differentiable(kinova, generator):
         return (*kinova.pose_and_jacobian(q), kinova.link_poses(q)["bracelet_link"])
 
     assert torch.autograd.gradcheck(outputs, (q,))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_poses_are_twice_differentiable_on_random_trees(tmp_path_factory, seed):
+    text = random_urdf(np.random.default_rng(seed), 3, branches=True, mimic=seed % 2 == 0)
+    robot = load(tmp_path_factory, text, tool="tool")
+    q = robot.sample(2, torch.Generator().manual_seed(seed)).requires_grad_()
+
+    def outputs(q):
+        return (*robot.pose_and_jacobian(q), *robot.link_poses(q).values())
+
+    assert torch.autograd.gradcheck(outputs, (q,))
+    assert torch.autograd.gradgradcheck(lambda q: robot.forward_kinematics(q), (q,))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_few_and_many_configurations_give_the_same_frames(tmp_path_factory, kinova, seed):
+    text = random_urdf(np.random.default_rng(seed), 6, branches=True, mimic=seed % 2 == 0)
+    for robot in (kinova, load(tmp_path_factory, text, tool="tool")):
+        q = robot.columns(torch.cat([torch.zeros(1, robot.n), robot.sample(40, torch.Generator().manual_seed(seed))]))
+        many = robot.tree.frames(q)
+        few = torch.cat([robot.tree.frames(column) for column in q.split(1, dim=1)], dim=-1)
+        torch.testing.assert_close(few, many, atol=1e-13, rtol=0)
 
 
 def test_a_configuration_of_the_wrong_length_is_an_error(kinova):

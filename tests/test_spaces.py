@@ -66,14 +66,17 @@ def test_the_middle_is_half_way_on_both_sides(a, b):
 def test_the_average_turns_with_its_inputs(near, shift):
     near, shift = tensors(near, shift)
     weights = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
-    turned = cspace.weighted_average(near + shift, weights, CONTINUOUS)
-    plain = cspace.weighted_average(near, weights, CONTINUOUS) + shift
+    turned, plain = (
+        cspace.average((weights[:, None] * cspace.embed(q, CONTINUOUS)).sum(0), CONTINUOUS)
+        for q in (near + shift, near)
+    )
+    plain = plain + shift
     assert cspace.distance(turned, plain, CONTINUOUS) < 1e-9
 
 
 def test_the_average_of_configurations_across_the_seam_stays_there():
     q = torch.tensor([[3.1, 1.0, -3.1], [-3.1, 3.0, 3.1]], dtype=torch.float64)
-    average = cspace.weighted_average(q, torch.ones(2, dtype=torch.float64), CONTINUOUS)
+    average = cspace.average(cspace.embed(q, CONTINUOUS).sum(0), CONTINUOUS)
     torch.testing.assert_close(average.abs(), torch.tensor([math.pi, 2.0, math.pi], dtype=torch.float64))
 
 
@@ -209,7 +212,7 @@ def test_centres_are_in_the_middle_of_their_corners():
 
 def test_neighbours_are_the_nearest(generator):
     graph = random_graph([(0.0, 1.0)] * 3, 200, k=5, generator=generator)
-    indices, distances = graph.neighbours(9)
+    indices, distances = graph.neighbours(torch.arange(200), 9)
     full = torch.cdist(graph.points, graph.points).fill_diagonal_(torch.inf)
     expected = full.topk(9, largest=False)
     torch.testing.assert_close(distances, expected.values)
@@ -218,9 +221,33 @@ def test_neighbours_are_the_nearest(generator):
     assert torch.equal(graph.nearest(graph.points + 1e-9)[:, 0], torch.arange(200))
 
 
+@given(st.integers(2, 3), st.integers(1, 200), st.floats(0.3, 3.0), st.integers(1, 70))
+def test_a_grid_s_arithmetic_finds_what_a_search_finds(dimension, n, stretch, k):
+    graph = staggered_grid([(-1.0, 1.0), (0.0, stretch), (2.0, 3.0)][:dimension], n)
+    count = len(graph.points)
+    indices, distances = graph.neighbours(torch.arange(count), k)
+    found = torch.full((count, count), torch.inf, dtype=torch.float64)
+    rows = torch.arange(count)[:, None].expand_as(indices)
+    there = distances.isfinite()
+    found[rows[there], indices[there]] = distances[there]
+    assert int(there.sum()) == int(found.isfinite().sum()), "a neighbour was listed twice"
+    everything = torch.cdist(graph.points, graph.points, compute_mode="donot_use_mm_for_euclid_dist")
+    everything.fill_diagonal_(torch.inf)
+    near = everything <= distances[there].amax() * (1.0 + 1e-12) if there.any() else everything < 0.0
+    torch.testing.assert_close(found, torch.where(near, everything, torch.inf))
+
+
+def test_an_inner_vertex_of_a_grid_has_all_its_neighbours():
+    graph = staggered_grid([(-1.0, 1.0)] * 3, 3000)
+    middle = graph.nearest(torch.zeros(1, 3, dtype=torch.float64))[0]
+    for k in (1, 8, 14, 30, 64):
+        distances = graph.neighbours(middle, k)[1]
+        assert int(distances.isfinite().sum()) >= k
+
+
 def test_adjacency_lists_both_directions():
     graph = TaskGraph(torch.rand(3, 2, dtype=torch.float64), torch.tensor([[0, 2], [1, 2]]))
-    assert [part.tolist() for part in graph.adjacency] == [[0, 1, 2, 2], [2, 2, 0, 1]]
+    assert [part.tolist() for part in graph.adjacency] == [[0, 1, 2, 4], [2, 2, 0, 1]]
 
 
 @pytest.mark.parametrize(

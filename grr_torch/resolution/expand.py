@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from grr_torch.errors import ParameterError
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, project_columns
+from grr_torch.resolution.reachability import within_reach
 from grr_torch.resolution.seeds import SeedsLike, check_seeds, place_seeds
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.configuration import weighted_average
+from grr_torch.spaces.configuration import average, embed
 from grr_torch.spaces.graph import TaskGraph
 from grr_torch.spaces.task import TaskSpace
+
+# vertices whose neighbours are listed at once
+_VERTICES_AT_ONCE = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -73,35 +79,51 @@ def expand(
     count = len(graph.points)
     configurations = torch.full((count, robot.n), torch.nan, dtype=robot.dtype, device=robot.device)
     wave = torch.full((count,), -1, dtype=torch.int32, device=robot.device)
-    vertices, placed = place_seeds(robot, task, graph, check_seeds(robot, seeds), tolerances)
-    configurations[vertices], wave[vertices] = placed, 0
-    nearest, distances = (part.to(robot.device) for part in graph.neighbours(neighbours))
-    # (max d / d)² normalised is 1 / d² normalised
-    weights = distances.square().reciprocal().to(robot.dtype)
+    # what is averaged: rows of zeros where unresolved
+    embedded = configurations.new_zeros(count, 2 * robot.n)
     starts, ends = (part.to(robot.device) for part in graph.adjacency)
-    targets = graph.points.to(device=robot.device, dtype=robot.dtype)
-    tried_with = torch.zeros(count, dtype=torch.int32, device=robot.device)
-    current = 0
-    while True:
-        resolved = wave >= 0
-        around = torch.zeros_like(tried_with).index_add_(0, starts, resolved[ends].int())
+    targets = graph.points.to(device=robot.device, dtype=robot.dtype).T.contiguous()
+    candidates = within_reach(robot, task, graph.points).to(robot.device)
+    waiting = torch.zeros_like(candidates)
+    found, placed = place_seeds(robot, task, graph, check_seeds(robot, seeds), tolerances)
+    for current in itertools.count():
+        configurations[found], wave[found], candidates[found] = placed, current, False
+        embedded[found] = embed(placed, robot.continuous)
+        waiting[_rows(starts, ends, found)] = True
+        frontier = (waiting & candidates).nonzero()[:, 0]
+        progress("expanding", int((wave >= 0).sum()), count)
+        guesses, known = _average(graph, embedded, frontier, neighbours, robot.continuous)
         # an edge may lead to a vertex that is not among the nearest; its end waits until one of these is resolved
-        frontier = (~resolved & (around > tried_with)).nonzero()[:, 0]
-        frontier = frontier[resolved[nearest[frontier]].any(1)]
-        progress("expanding", int(resolved.sum()), count)
+        frontier = frontier[known]
         if len(frontier) == 0:
             return Expansion(configurations, wave)
-        current += 1
-        near = nearest[frontier]
-        known = resolved[near]
-        weight = torch.where(known, weights[frontier], 0.0)
-        average = weighted_average(configurations[near].nan_to_num(), weight, robot.continuous)
-        solved, valid = project_columns(
-            robot, task, targets[frontier].T.contiguous(), average.T.contiguous(), tolerances
-        )
-        tried_with[frontier] = around[frontier]
-        found = frontier[valid]
-        configurations[found], wave[found] = solved.T[valid], current
+        waiting[frontier] = False
+        solved, valid = project_columns(robot, task, targets[:, frontier], guesses[known].T.contiguous(), tolerances)
+        found, placed = frontier[valid], solved.T[valid]
+    raise AssertionError("unreachable")
+
+
+def _average(
+    graph: TaskGraph, embedded: Tensor, vertices: Tensor, neighbours: int, continuous: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Weighted averages (F, n) of the resolved among the nearest vertices, and where there are any (F,).
+
+    2n multiply-adds a neighbour. Weights are 1 / d²: what (max d / d)² is, but for a factor.
+    """
+    sums: list[Tensor] = []
+    for part in vertices.split(_VERTICES_AT_ONCE):
+        nearest, distances = graph.neighbours(part, neighbours)
+        weights = distances.to(embedded).square().reciprocal()
+        sums.append(embedding_bag(nearest, embedded, per_sample_weights=weights, mode="sum"))
+    total = torch.cat(sums)
+    return average(total, continuous), (total != 0.0).any(1)
+
+
+def _rows(starts: Tensor, ends: Tensor, vertices: Tensor) -> Tensor:
+    """The neighbours along edges of all these vertices, one after the other."""
+    counts = starts[vertices + 1] - starts[vertices]
+    before = counts.cumsum(0) - counts
+    return ends[torch.repeat_interleave(starts[vertices] - before, counts) + torch.arange(int(counts.sum()), device=ends.device)]
 
 
 def default_neighbours(task: TaskSpace) -> int:

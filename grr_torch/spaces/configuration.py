@@ -37,17 +37,18 @@ def interpolate(start: Tensor, end: Tensor, fraction: float | Tensor, continuous
     return normalise(start + fraction * difference(start, end, continuous), continuous)
 
 
-def weighted_average(q: Tensor, weights: Tensor, continuous: Tensor) -> Tensor:
-    """Weighted averages (*batch, n) over the k configurations (*batch, k, n).
+def embed(q: Tensor, continuous: Tensor) -> Tensor:
+    """Configurations (*batch, n) as rows (*batch, 2n) whose weighted sums `average` reads.
+
+    (cos q, sin q) of a continuous joint, (q, 1) of another.
+    """
+    return torch.cat([torch.where(continuous, q.cos(), q), torch.where(continuous, q.sin(), 1.0)], dim=-1)
+
+
+def average(sums: Tensor, continuous: Tensor) -> Tensor:
+    """Averages (*batch, n) from weighted sums (*batch, 2n) of `embed`; the weights need not add up to one.
 
     Continuous joints are averaged on the circle: the direction of the weighted sum of their unit vectors.
-
-    Args:
-        q: (*batch, k, n) configurations.
-        weights: (*batch, k) non-negative weights, not all zero; they need not add up to one.
-        continuous: (n,) bool.
     """
-    weights = (weights / weights.sum(-1, keepdim=True))[..., None]
-    linear = (weights * q).sum(-2)
-    circular = torch.atan2((weights * q.sin()).sum(-2), (weights * q.cos()).sum(-2))
-    return torch.where(continuous, circular, linear)
+    first, second = sums.chunk(2, dim=-1)
+    return torch.where(continuous, torch.atan2(second, first), first / second)

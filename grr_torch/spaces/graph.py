@@ -10,10 +10,12 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
+from grr_torch.spaces.lattice import Lattice
 
 Bounds = Sequence[tuple[float, float]]
 
@@ -30,10 +32,12 @@ class TaskGraph:
     Attributes:
         points: (V, d) positions [m], float64, on the CPU.
         edges: (E, 2) vertex indices, smaller one first.
+        lattice: Where the points are a staggered grid's: its arithmetic, which finds neighbours without a search.
     """
 
     points: Tensor
     edges: Tensor
+    lattice: Lattice | None = None
 
     def __post_init__(self) -> None:
         points, edges = self.points, self.edges
@@ -44,26 +48,31 @@ class TaskGraph:
         if not inside or bool(((edges < 0) | (edges >= len(points))).any()):
             shape = f"{edges.dtype} of shape {tuple(edges.shape)}"
             raise ParameterError("edges of a graph", shape, f"torch.int64 of shape (E, 2), from 0 to {len(points) - 1}")
-        if len(torch.unique(points, dim=0)) < len(points):
+        if self.lattice is None and _some_coincide(points.numpy()):
             raise ParameterError("points of a graph", "two that coincide", "points that differ")
 
     @cached_property
     def _tree(self) -> cKDTree:
         return cKDTree(self.points.numpy())
 
-    def neighbours(self, k: int) -> tuple[Tensor, Tensor]:
-        """The k nearest other vertices of each vertex, nearest first.
+    def neighbours(self, vertices: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """The k nearest other vertices of some vertices.
+
+        In a staggered grid, those as near as the k-th are among them, and what would lie beyond its border is not.
 
         Args:
+            vertices: (F,) vertices.
             k: How many; fewer are given where the graph has fewer vertices.
 
         Returns:
-            Indices (V, k) and distances (V, k) [m].
+            Indices (F, K) and distances (F, K) [m]; inf where there is no such vertex.
         """
-        k = min(k, len(self.points) - 1)
-        distances, indices = self._tree.query(self.points.numpy(), k=range(1, k + 2), workers=-1)
+        if self.lattice is not None:
+            return self.lattice.neighbours(vertices, k)
+        ranks = range(1, min(k + 1, len(self.points)) + 1)
+        distances, indices = self._tree.query(self.points[vertices.cpu()].numpy(), k=ranks, workers=-1)
         # the vertex itself comes first: no two vertices coincide
-        return torch.from_numpy(indices[:, 1:]), torch.from_numpy(distances[:, 1:])
+        return torch.from_numpy(indices[:, 1:]).to(vertices.device), torch.from_numpy(distances[:, 1:]).to(vertices.device)
 
     def nearest(self, points: Tensor, k: int = 1) -> Tensor:
         """Indices (*batch, k) of the vertices nearest to each point (*batch, d), nearest first."""
@@ -72,10 +81,16 @@ class TaskGraph:
 
     @cached_property
     def adjacency(self) -> tuple[Tensor, Tensor]:
-        """Both directions of all edges, sorted by start: (2E,) starts and (2E,) ends."""
-        both = torch.cat([self.edges, self.edges.flip(1)])
-        order = torch.argsort(both[:, 0] * len(self.points) + both[:, 1])
-        return both[order, 0], both[order, 1]
+        """Compressed rows: the neighbours along edges of vertex v are ends[starts[v] : starts[v + 1]]."""
+        first, second = self.edges.numpy().T
+        both = (np.concatenate([first, second]), np.concatenate([second, first]))
+        rows = csr_matrix((np.ones(len(both[0]), dtype=np.int8), both), shape=(len(self.points),) * 2)
+        return torch.from_numpy(rows.indptr.astype(np.int64)), torch.from_numpy(rows.indices.astype(np.int64))
+
+
+def _some_coincide(points: np.ndarray) -> bool:
+    ordered = points[np.lexsort(points.T)]
+    return bool((ordered[1:] == ordered[:-1]).all(1).any())
 
 
 def check_bounds(bounds: Bounds) -> tuple[tuple[float, float], ...]:
@@ -132,7 +147,8 @@ def staggered_grid(bounds: Bounds, n: int) -> TaskGraph:
     for shift in itertools.product((0, 1), repeat=len(cells)):
         window = tuple(slice(s, s + count) for s, count in zip(shift, cells, strict=True))
         edges.append(np.stack([corner[window].ravel(), centre.ravel()], axis=1))
-    return TaskGraph(torch.from_numpy(points), torch.from_numpy(np.concatenate(edges)))
+    spacing = tuple((high - low) / count for (low, high), count in zip(pairs, cells, strict=True))
+    return TaskGraph(torch.from_numpy(points), torch.from_numpy(np.concatenate(edges)), Lattice(cells, spacing))
 
 
 def random_graph(bounds: Bounds, n: int, *, k: int, generator: torch.Generator | None = None) -> TaskGraph:
@@ -152,7 +168,7 @@ def random_graph(bounds: Bounds, n: int, *, k: int, generator: torch.Generator |
         raise ParameterError("k", k, f"1 to {n - 1}: each point is joined to others")
     low, high = torch.tensor(pairs, dtype=torch.float64).T
     points = low + (high - low) * torch.rand(n, len(pairs), dtype=torch.float64, generator=generator)
-    indices = TaskGraph(points, torch.empty(0, 2, dtype=torch.long)).neighbours(k)[0]
+    indices = TaskGraph(points, torch.empty(0, 2, dtype=torch.long)).neighbours(torch.arange(n), k)[0]
     pairs_of = torch.stack([torch.arange(n)[:, None].expand_as(indices), indices], dim=-1).reshape(-1, 2)
     return TaskGraph(points, torch.unique(pairs_of.sort(dim=1).values, dim=0))
 

@@ -1,0 +1,72 @@
+"""The arithmetic of a staggered grid: which vertices lie round another one, without a search."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Corners of a grid of cells, and behind them the cells' centres, both in C order.
+
+    In units of half a cell, a corner has even coordinates and a centre odd ones. So the same displacements, all even
+    or all odd, lead from any vertex to its neighbours.
+
+    Attributes:
+        cells: How many cells there are along each axis.
+        spacing: Their lengths [m].
+    """
+
+    cells: tuple[int, ...]
+    spacing: tuple[float, ...]
+
+    def neighbours(self, vertices: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """Indices (F, K) and distances (F, K) [m] of the k nearest vertices, as `TaskGraph.neighbours` gives them."""
+        displacements, lengths = (part.to(vertices.device) for part in self._stencil(k))
+        index = vertices.new_zeros(len(vertices), len(lengths))
+        inside = torch.ones_like(index, dtype=torch.bool)
+        corners = math.prod(count + 1 for count in self.cells)
+        is_centre = vertices >= corners
+        to_centre = (is_centre[:, None] + displacements[:, 0]) % 2 == 1
+        for axis, coordinate in enumerate(self._coordinates(vertices)):
+            place = coordinate[:, None] + displacements[:, axis]
+            inside &= (place >= 0) & (place <= 2 * self.cells[axis])
+            index = torch.where(to_centre, index * self.cells[axis], index * (self.cells[axis] + 1)) + (place >> 1)
+        index = torch.where(to_centre, index + corners, index)
+        return torch.where(inside, index, 0), torch.where(inside, lengths, torch.inf)
+
+    def _coordinates(self, vertices: Tensor) -> list[Tensor]:
+        """(F,) coordinates of vertices along each axis, in half cells."""
+        corners = math.prod(count + 1 for count in self.cells)
+        is_centre = vertices >= corners
+        rest = torch.where(is_centre, vertices - corners, vertices)
+        coordinates: list[Tensor] = []
+        for count in self.cells[::-1]:
+            size = torch.where(is_centre, count, count + 1)
+            coordinates.append(2 * (rest % size) + is_centre.long())
+            rest = rest // size
+        return coordinates[::-1]
+
+    def _stencil(self, k: int) -> tuple[Tensor, Tensor]:
+        """Displacements (K, d) in half cells and their lengths (K,) [m], nearest first."""
+        reach = 2
+        while True:
+            box = itertools.product(range(-reach, reach + 1), repeat=len(self.cells))
+            offsets = [o for o in box if any(o) and len({axis % 2 for axis in o}) == 1]
+            lengths = [math.hypot(*(0.5 * a * s for a, s in zip(o, self.spacing, strict=True))) for o in offsets]
+            order = sorted(range(len(offsets)), key=lambda i: (lengths[i], offsets[i]))
+            # whatever lies outside the box is farther than its nearest face
+            if len(order) >= k and lengths[order[k - 1]] < 0.5 * (reach + 1) * min(self.spacing):
+                break
+            if reach > 2 * max(self.cells):
+                break
+            reach += 1
+        last = lengths[order[min(k, len(order)) - 1]] * (1.0 + 1e-9)
+        order = [i for i in order if lengths[i] <= last]
+        kept = [offsets[i] for i in order]
+        return torch.tensor(kept), torch.tensor([lengths[i] for i in order], dtype=torch.float64)
