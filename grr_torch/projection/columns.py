@@ -16,9 +16,21 @@ def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Te
         error: (m, N).
         damping: (N,) λ > 0.
     """
-    normal = (jacobian[:, None] * jacobian).sum(2)
+    # a joint at a time: all products at once would leave the cache
+    first, *others = jacobian.unbind(1)
+    normal = first[:, None] * first
+    for column in others:
+        normal.addcmul_(column[:, None], column)
     normal.diagonal(dim1=0, dim2=1).add_(damping[:, None])
-    return (jacobian * solve_spd(normal, error)[:, None]).sum(0)
+    return transposed_product(jacobian, solve_spd(normal, error))
+
+
+def transposed_product(jacobian: Tensor, right: Tensor) -> Tensor:
+    """Jᵀ b (n, N) for J (m, n, N) and b (m, N)."""
+    result = jacobian[0] * right[0]
+    for row, factor in zip(jacobian[1:], right[1:], strict=True):
+        result.addcmul_(row, factor)
+    return result
 
 
 def solve_spd(matrix: Tensor, right: Tensor) -> Tensor:

@@ -70,7 +70,7 @@ class KinematicTree:
     def _frames_of_many(self, q: Tensor) -> Tensor:
         """Joint by joint, parents first: 84 multiply-adds a joint and configuration, four passes, in place."""
         width, count = q.shape[1], len(self.joints)
-        values = self._joint_values(q)
+        values = self._joint_values(q, self._joint_matrices[3][:count])
         cosines, sines = values.cos().unbind(0), values.sin().unbind(0)
         frames, scratch = q.new_empty(count + 2, 4, 3, width), q.new_empty(6, 3, width)
         frames[-1] = torch.eye(4, 3, dtype=q.dtype, device=q.device)[:, :, None]
@@ -95,14 +95,12 @@ class KinematicTree:
 
         64 multiply-adds a frame and round, ⌈log₂ of the depth⌉ rounds; two calls each, whatever the number of joints.
         """
-        fixed, along_cosine, along_sine = self._joint_matrices
-        values = self._joint_values(q).T
-        pad = (*values.shape[:-1], 2)
-        cosines, sines = values.cos(), values.sin()
+        fixed, along_cosine, along_sine, dofs = self._joint_matrices
+        values = self._joint_values(q, dofs).T[..., None, None]
+        sines = values.sin()
         if self._sliding is not None:
-            sines = torch.where(self._sliding, values, sines)
-        cosines, sines = (torch.cat([part, part.new_zeros(pad)], dim=-1)[..., None, None] for part in (cosines, sines))
-        poses = torch.addcmul(torch.addcmul(fixed, along_cosine, cosines), along_sine, sines)
+            sines = torch.where(self._sliding[:, None, None], values, sines)
+        poses = torch.addcmul(torch.addcmul(fixed, along_cosine, values.cos()), along_sine, sines)
         for parents in self._ancestors:
             poses = torch.matmul(poses, poses.index_select(1, parents))
         return poses[..., :3].permute(1, 2, 3, 0)
@@ -122,31 +120,35 @@ class KinematicTree:
 
         Column of a revolute joint: (z × (p_tool − p), z); of a prismatic one: (z, 0). 9 multiply-adds a column.
         """
-        lines = frames[: len(self.path)] if self._plain_path else frames[list(self.path)]
-        _, axes, origins = lines.split((2, 1, 1), dim=1)
-        ax, ay, az = axes[:, 0].unbind(1)
-        rx, ry, rz = (frames[-2, 3] - origins[:, 0]).unbind(1)
-        rows = torch.stack([ay * rz - az * ry, az * rx - ax * rz, ax * ry - ay * rx, ax, ay, az])
-        if self._sliding is not None:
-            keep = torch.where(self._sliding[list(self.path)], 0.0, 1.0).to(rows)[:, None]
-            axis = rows[3:]
-            rows = rows * keep + torch.cat([axis, torch.zeros_like(axis)]) * (1.0 - keep)
-        if self._plain_path:
+        lines = frames[: self.n] if self._plain_path else frames[list(self.path)]
+        axes = lines[:, 2]
+        arms = frames[-2, 3] - lines[:, 3]
+        if frames.shape[3] <= _FEW:
+            rows = torch.cat([torch.linalg.cross(axes, arms, dim=1), axes], dim=1).transpose(0, 1)
+        else:
+            # torch's own cross product takes three times as long
+            ax, ay, az = axes.unbind(1)
+            rx, ry, rz = arms.unbind(1)
+            rows = torch.stack([ay * rz - az * ry, az * rx - ax * rz, ax * ry - ay * rx, ax, ay, az])
+        if self._plain_path and self._sliding is None:
             return rows
+        if self._sliding is not None:
+            slides = self._sliding[list(self.path)][:, None]
+            linear, angular = rows.split(3)
+            rows = torch.cat([torch.where(slides, angular, linear), torch.where(slides, 0.0, angular)])
         # ∂/∂q sums over the joints that q drives
         drive = rows.new_zeros(self.n, len(self.path))
         for k, i in enumerate(self.path):
             drive[self.joints[i].dof, k] = self.joints[i].multiplier
         return torch.einsum("dk,rkN->rdN", drive, rows)
 
-    def _joint_values(self, q: Tensor) -> Tensor:
-        dofs = [joint.dof for joint in self.joints]
-        values = q if dofs == list(range(self.n)) else q[dofs]
-        if all(joint.multiplier == 1.0 and joint.offset == 0.0 for joint in self.joints):
+    def _joint_values(self, q: Tensor, dofs: Tensor) -> Tensor:
+        """(F, N) values of frames' joints; those that stand still have any value."""
+        values = q.index_select(0, dofs)
+        if self._mimic is None:
             return values
-        scale = q.new_tensor([[joint.multiplier] for joint in self.joints])
-        shift = q.new_tensor([[joint.offset] for joint in self.joints])
-        return values * scale + shift
+        multipliers, offsets = self._mimic
+        return values * multipliers[: len(values)] + offsets[: len(values)]
 
     def _joint_gradient(self, gradient: Tensor) -> Tensor:
         """(n, N) from (J, N): each entry of q takes what its joints give."""
@@ -177,15 +179,25 @@ class KinematicTree:
 
     @cached_property
     def _sliding(self) -> Tensor | None:
-        """(J,) joints that slide; None if none does."""
+        """(F,) frames of joints that slide; None if none does."""
         sliding = [not joint.revolute for joint in self.joints]
-        return torch.tensor(sliding, device=self.mounts[0].device) if any(sliding) else None
+        return torch.tensor([*sliding, False, False], device=self.mounts[0].device) if any(sliding) else None
 
     @cached_property
-    def _joint_matrices(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(F, 4, 4) each: a frame in its parent's is the first plus cos θ times the second plus sin θ times the third.
+    def _mimic(self) -> tuple[Tensor, Tensor] | None:
+        """(F, 1) multipliers and offsets of joint values; None if they are those of q."""
+        figures = [(joint.multiplier, joint.offset) for joint in self.joints] + [(1.0, 0.0)] * 2
+        if all(figure == (1.0, 0.0) for figure in figures):
+            return None
+        multipliers, offsets = self.mounts[0].new_tensor(figures).T[..., None]
+        return multipliers, offsets
 
-        Of a sliding joint, the value stands in place of the sine. Rows are as in `mounts`.
+    @cached_property
+    def _joint_matrices(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Constants of `_frames_of_few` by frame: A, B and C (F, 4, 4), and the entry of q that drives it (F,).
+
+        A frame in its parent's is A + cos θ B + sin θ C, rows as in `mounts`; of a sliding joint, the value stands in
+        place of the sine.
         """
         fixed, along_cosine, along_sine = (self.mounts[0].new_zeros(len(self.joints) + 2, 4, 4) for _ in range(3))
         for index, (joint, mount) in enumerate(zip(self.joints, self.mounts, strict=True)):
@@ -198,7 +210,8 @@ class KinematicTree:
                 along_sine[index, 3] = mount[2]
         fixed[-2] = self.links[self.tool][1]
         fixed[-1] = torch.eye(4)
-        return fixed, along_cosine, along_sine
+        dofs = torch.tensor([joint.dof for joint in self.joints] + [0, 0], device=fixed.device)
+        return fixed, along_cosine, along_sine, dofs
 
     @cached_property
     def _ancestors(self) -> tuple[Tensor, ...]:
@@ -240,5 +253,5 @@ class _Frames(torch.autograd.Function):
         axes, origins = frames[:-2, 2], frames[:-2, 3]
         turning = (axes * (moments - torch.linalg.cross(origins, forces, dim=1))).sum(1)
         if tree._sliding is not None:
-            turning = torch.where(tree._sliding[:, None], (axes * forces).sum(1), turning)
+            turning = torch.where(tree._sliding[:-2, None], (axes * forces).sum(1), turning)
         return tree._joint_gradient(turning), None

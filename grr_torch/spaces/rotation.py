@@ -66,16 +66,21 @@ def slerp(start: Tensor, end: Tensor, fraction: float | Tensor) -> Tensor:
 def rotation_error(target: Tensor, rotation: Tensor) -> Tensor:
     """Rotation vectors (3, N) [rad] that turn `rotation` (3, 3, N) into `target` (3, 3, 1 or N), in the base frame.
 
-    Norms reach π; there, where the axis is not unique, one of the two is taken.
+    Norms reach π; there, where the axis is not unique, one of the two is taken. 27 multiply-adds, an arctangent.
     """
     # vee(T Rᵀ − R Tᵀ) / 2 = ½ Σ columns r × t = axis · sin(angle)
-    twisted = 0.5 * torch.linalg.cross(rotation, target.expand_as(rotation), dim=0).sum(1)
+    twisted = torch.stack(
+        [
+            (rotation[1] * target[2] - rotation[2] * target[1]).sum(0),
+            (rotation[2] * target[0] - rotation[0] * target[2]).sum(0),
+            (rotation[0] * target[1] - rotation[1] * target[0]).sum(0),
+        ]
+    ).mul_(0.5)
     cosine = 0.5 * ((rotation * target).sum((0, 1)) - 1.0)
-    sine = twisted.norm(dim=0)
-    angle = torch.atan2(sine, cosine)
-    scale = torch.where(sine > 1e-7, angle / sine.clamp_min(1e-7), 1.0)
-    error = twisted * scale
-    flipped = (sine <= 1e-7) & (cosine < 0.0)
+    sine = twisted.square().sum(0).sqrt()
+    tiny = sine < 1e-7
+    error = twisted * torch.where(tiny, 1.0, torch.atan2(sine, cosine) / sine)
+    flipped = tiny & (cosine < 0.0)
     if bool(flipped.any()):
         # at π, T Rᵀ = 2 a aᵀ − 1: any column of T Rᵀ + 1 points along the axis
         product = torch.einsum("ikN,jkN->ijN", target.expand_as(rotation), rotation)[..., flipped]
