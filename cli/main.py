@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import typer
+from grr_torch.cli.bench import app as bench
 from grr_torch.cli.build import build
 from grr_torch.cli.info import info
 from grr_torch.cli.robots import robots
@@ -26,6 +27,7 @@ app = typer.Typer(
 )
 for command in (robots, build, info, view, spheres):
     app.command()(command)
+app.add_typer(bench)
 
 
 def _print_version(wanted: bool) -> None:

@@ -83,6 +83,15 @@ def print_rows(title: str, rows: list[tuple[str, str]]) -> None:
         typer.echo(f"{name:{width}}  {value}")
 
 
+def markdown_table(head: list[str], rows: list[list[str]]) -> str:
+    """A table that reads well as it is, and in a README."""
+    widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
+    lines = [head, ["-" * width for width in widths], *rows]
+    return "\n".join(
+        "| " + " | ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)) + " |" for line in lines
+    )
+
+
 def quality_rows(quality: dict[str, Any]) -> list[tuple[str, str]]:
     """The figures of `Roadmap.quality()` for people."""
 

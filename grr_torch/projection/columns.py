@@ -52,7 +52,9 @@ def solve_spd(matrix: Tensor, right: Tensor) -> Tensor:
         column, others = block.split_with_sizes((1, columns_left), 1)
         pivot, factors = column.split_with_sizes((1, m - 1))
         row, rest = others.split_with_sizes((1, m - 1))
-        row = row / pivot
+        block = torch.empty_like(others)
         # the row goes last: after m steps all are back in order
-        block = torch.cat([torch.addcmul(rest, factors, row, value=-1.0), row])
+        cleared, last = block.split_with_sizes((m - 1, 1))
+        torch.div(row, pivot, out=last)
+        torch.addcmul(rest, factors, last, value=-1.0, out=cleared)
     return block[:, 0]

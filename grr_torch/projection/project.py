@@ -181,9 +181,7 @@ def _project(
     return solved, valid
 
 
-def _step(
-    q: Tensor, jacobian: Tensor, error: Tensor, damping: Tensor, limits: tuple[Tensor, Tensor] | None
-) -> Tensor:
+def _step(q: Tensor, jacobian: Tensor, error: Tensor, damping: Tensor, limits: tuple[Tensor, Tensor] | None) -> Tensor:
     """Configurations after one step, within limits."""
     step = damped_least_squares(jacobian, error, damping)
     longest = step.abs().amax(0)
@@ -198,19 +196,19 @@ def _step(
     stopped = kept != moved
     columns = stopped.any(0).nonzero()[:, 0]
     if len(columns):
-        parts = (part[..., columns] for part in (q, kept, stopped, jacobian, error, damping))
-        kept[:, columns] = _stop_at_limits(*parts, limits)
+        parts = [part[..., columns] for part in (q, kept, stopped, jacobian, error, damping)]
+        kept[:, columns] = _stop_at_limits(limits, *parts)
     return kept
 
 
 def _stop_at_limits(
+    limits: tuple[Tensor, Tensor],
     q: Tensor,
     kept: Tensor,
     stopped: Tensor,
     jacobian: Tensor,
     error: Tensor,
     damping: Tensor,
-    limits: tuple[Tensor, Tensor],
 ) -> Tensor:
     """Configurations after a step in which joints that would leave their range stop at its end, at `kept`.
 

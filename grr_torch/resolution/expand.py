@@ -113,6 +113,9 @@ def _average(
     sums: list[Tensor] = []
     for part in vertices.split(_VERTICES_AT_ONCE):
         nearest, distances = graph.neighbours(part, neighbours)
+        if nearest.numel() == 0:
+            sums.append(embedded.new_zeros(len(part), embedded.shape[1]))
+            continue
         weights = distances.to(embedded).square().reciprocal()
         sums.append(embedding_bag(nearest, embedded, per_sample_weights=weights, mode="sum"))
     total = torch.cat(sums)
@@ -123,7 +126,9 @@ def _rows(starts: Tensor, ends: Tensor, vertices: Tensor) -> Tensor:
     """The neighbours along edges of all these vertices, one after the other."""
     counts = starts[vertices + 1] - starts[vertices]
     before = counts.cumsum(0) - counts
-    return ends[torch.repeat_interleave(starts[vertices] - before, counts) + torch.arange(int(counts.sum()), device=ends.device)]
+    return ends[
+        torch.repeat_interleave(starts[vertices] - before, counts) + torch.arange(int(counts.sum()), device=ends.device)
+    ]
 
 
 def default_neighbours(task: TaskSpace) -> int:

@@ -16,8 +16,8 @@ import torch
 
 from grr_torch.errors import ParameterError
 from grr_torch.progress import Progress, silent
-from grr_torch.robots.geometry import Points, link_meshes
 from grr_torch.robots.compile_tree import compile_tree, degrees_of_freedom
+from grr_torch.robots.geometry import Points, link_meshes
 from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.spheres import Sphere, ordered_pair
 from grr_torch.robots.urdf import Urdf, sampling_range

@@ -64,7 +64,7 @@ class KinematicTree:
     def frames(self, q: Tensor) -> Tensor:
         """Poses (F, 4, 3, N) of all frames for configurations q (n, N); the last two are the tool and the base."""
         if torch.is_grad_enabled() and q.requires_grad:
-            return _Frames.apply(q, self)  # type: ignore[no-any-return]
+            return _Frames.apply(q, self)  # type: ignore[no-untyped-call]
         return self._frames_of_few(q) if q.shape[1] <= _FEW else self._frames_of_many(q)
 
     def _frames_of_many(self, q: Tensor) -> Tensor:

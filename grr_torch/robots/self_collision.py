@@ -13,7 +13,7 @@ from grr_torch.robots.kinematics import KinematicTree, place
 from grr_torch.robots.spheres import Sphere, SphereModel
 
 # sphere-pair distances held at once: they should stay in the cache
-_PAIRS_AT_ONCE = 1 << 17
+_PAIRS_AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 26}
 
 
 class _Pair(NamedTuple):
@@ -34,7 +34,7 @@ class _Pair(NamedTuple):
 
         |a|² − 2 a·b + |b|² as one matrix product: 5 multiply-adds a pair of spheres.
         """
-        at_once = max(1, _PAIRS_AT_ONCE // self.reach.numel())
+        at_once = max(1, _PAIRS_AT_ONCE[relative.device.type] // self.reach.numel())
         for start in range(0, relative.shape[2], at_once):
             part = relative[:, :, start : start + at_once]
             b = place(part, self.second).transpose(0, 1)

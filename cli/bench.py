@@ -1,0 +1,104 @@
+"""`grr-torch bench`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+
+if TYPE_CHECKING:
+    from grr_torch.experiments.speed import Row, SpeedTable
+
+app = typer.Typer(name="bench", help="Measure: the tables of the README.", no_args_is_help=True)
+
+
+@app.callback()
+def _bench() -> None:
+    pass
+
+
+@app.command()
+@reports_errors
+def speed(
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="kinematics, projection, self-collision, build, process or growth; repeatable."),
+    ] = None,
+    peers: Annotated[
+        str | None, typer.Option(help="Of pytorch-kinematics,Pinocchio,Klampt; by default those that are installed.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(help="Medians are taken over so many.")] = 7,
+    threads: Annotated[int | None, typer.Option(min=1, help="For torch; by default what torch takes.")] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
+    profile: Annotated[
+        bool, typer.Option("--profile", help="Where a build's time goes, instead of the table.")
+    ] = False,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+) -> None:
+    """Print how fast everything is beside other libraries, as a Markdown table.
+
+    Example: grr-torch bench speed --only kinematics --only projection
+
+    Example: grr-torch bench speed --profile
+    """
+    import torch
+
+    from grr_torch.experiments.speed import measure_speed
+    from grr_torch.output import atomic_write, check_writable
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    if profile:
+        _show_profile(device)
+        return
+    if json_file is not None:
+        check_writable(json_file)
+    with progress_bar() as progress:
+        table = measure_speed(
+            sections=only,
+            peers=None if peers is None else [name.strip() for name in peers.split(",") if name.strip()],
+            repeats=repeats,
+            device=device,
+            progress=progress,
+        )
+    if json_file is not None:
+        with atomic_write(json_file) as path:
+            path.write_text(json.dumps(table.to_dict(), indent=2, ensure_ascii=False), encoding="utf-8")
+    _show_speed(table)
+
+
+def _show_speed(table: SpeedTable) -> None:
+    versions = {**table.machine, **table.peers}
+    typer.echo(", ".join(f"{name} {value}" for name, value in versions.items()) + "\n")
+    rows = [[row.what, _figure(row.ours), row.unit, _beside(row), _more(row)] for row in table.rows]
+    typer.echo(markdown_table(["what", "grr-torch", "unit", "beside it", "more"], rows))
+
+
+def _beside(row: Row) -> str:
+    ratios = row.ratios()
+    return ", ".join(f"{name} {_figure(value)} ({ratios[name]:.1f}×)" for name, value in row.peers.items())
+
+
+def _more(row: Row) -> str:
+    return ", ".join(f"{name} {_figure(value)}" for name, value in row.more.items())
+
+
+def _figure(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+
+
+def _show_profile(device: str) -> None:
+    from grr_torch.experiments.profile import profile_build
+    from grr_torch.robots.load import load_robot
+
+    columns: dict[str, list[float]] = {}
+    problems = [(robot, task) for robot in ("planar_5", "kinova") for task in ("position", "fixed-rotation")]
+    for robot, task in problems:
+        for stage in profile_build(load_robot(robot, device=device), task):
+            columns.setdefault(stage.name, []).append(1e3 * stage.seconds)
+    rows = [[name, *(f"{value:.1f}" for value in values)] for name, values in columns.items()]
+    rows.append(["sum", *(f"{sum(values):.1f}" for values in zip(*columns.values(), strict=True))])
+    typer.echo(markdown_table(["own time, ms", *(f"{robot} {task}" for robot, task in problems)], rows))

@@ -1,0 +1,68 @@
+"""Where the time of a build goes."""
+
+from __future__ import annotations
+
+import cProfile
+import pstats
+from dataclasses import dataclass
+from pathlib import Path
+
+import grr_torch
+from grr_torch.resolution.build import build
+from grr_torch.robots.robot import Robot
+
+# what a build spends its time in, by file and function; each without what is listed beside it
+STAGES: dict[str, set[tuple[str, str | None]]] = {
+    "poses": {("kinematics", "_frames_of_many"), ("kinematics", "_frames_of_few"), ("kinematics", "place")},
+    "Jacobians": {("kinematics", "jacobian")},
+    "damped least squares": {
+        ("columns", "damped_least_squares"),
+        ("columns", "solve_spd"),
+        ("columns", "transposed_product"),
+    },
+    "projection, rest": {("project", None), ("task", None), ("rotation", None)},
+    "self-collision": {("self_collision", None)},
+    "averages of neighbours": {("expand", "_average"), ("lattice", None), ("configuration", None), ("graph", None)},
+    "bisection": {("continuity", None)},
+}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Part of a build.
+
+    Attributes:
+        name: What was done.
+        seconds: How long it took.
+        calls: How often its functions were called.
+    """
+
+    name: str
+    seconds: float
+    calls: int
+
+
+def profile_build(robot: Robot, task: str) -> list[Stage]:
+    """Own time by stage, of a second build; torch's operators count for the function that calls them.
+
+    The profiler itself costs something: the sum is more than a build takes.
+    """
+    build(robot, task)
+    profiler = cProfile.Profile(builtins=False)
+    profiler.runcall(build, robot, task)
+    seconds = dict.fromkeys([*STAGES, "everything else"], 0.0)
+    calls = dict.fromkeys(seconds, 0)
+    package = Path(grr_torch.__file__).parent
+    for (file, _, function), (_, count, own, _, _) in pstats.Stats(profiler).stats.items():  # type: ignore[attr-defined]
+        stem = Path(file).stem if package in Path(file).parents else ""
+        name = _stage(stem, function)
+        seconds[name] += own
+        calls[name] += count
+    return [Stage(name, seconds[name], calls[name]) for name in seconds]
+
+
+def _stage(stem: str, function: str) -> str:
+    for name, members in STAGES.items():
+        if (stem, function) in members or (stem, None) in members:
+            return name
+    return "everything else"
