@@ -9,13 +9,20 @@ import torch
 from torch import Tensor
 
 # configurations worked on together: few enough for the cache, enough that a torch call costs less than its arithmetic
-_ON_CPU = 2560
+_ON_CPU = 2048
 _ON_GPU = 1 << 18
 
 
 def piece(device: torch.device) -> int:
     """How many columns are worked on together."""
     return _ON_CPU if device.type == "cpu" else _ON_GPU
+
+
+def slices(count: int, device: torch.device) -> list[slice]:
+    """As few equal pieces of `count` columns as keep to the size; one if there are none."""
+    pieces = -(-count // piece(device)) or 1
+    width = max(1, -(-count // pieces))
+    return [slice(start, start + width) for start in range(0, max(count, 1), width)]
 
 
 def in_pieces(function: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple[Tensor, ...]:
@@ -26,19 +33,18 @@ def in_pieces(function: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> 
         columns: Tensors with equal last axes.
     """
     count = columns[0].shape[-1]
-    pieces = -(-count // piece(columns[0].device)) or 1
-    width = -(-count // pieces)
+    first, *others = slices(count, columns[0].device)
     with one_thread():
-        results = function(*(tensor[..., :width] for tensor in columns))
-        if count <= width:
+        results = function(*(tensor[..., first] for tensor in columns))
+        if not others:
             return results
         # pieces are copied to their place at once: to keep them all and join them would take the memory twice
         joined = tuple(result.new_empty(*result.shape[:-1], count) for result in results)
-        for start in range(0, count, width):
-            if start:
-                results = function(*(tensor[..., start : start + width] for tensor in columns))
-            for whole, part in zip(joined, results, strict=True):
-                whole[..., start : start + width] = part
+        for part in (first, *others):
+            if part is not first:
+                results = function(*(tensor[..., part] for tensor in columns))
+            for whole, result in zip(joined, results, strict=True):
+                whole[..., part] = result
         return joined
 
 

@@ -223,7 +223,7 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(tmp_path, words, complaint)
 
 
 def test_ctrl_c_leaves_no_file(tmp_path):
-    words = ["build", "--robot", "kinova", "--points", "200000"]
+    words = ["build", "--robot", "kinova", "--reachability", "100000"]
     process = subprocess.Popen(
         [*PROGRAM, *words],
         cwd=tmp_path,

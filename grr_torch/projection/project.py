@@ -7,12 +7,13 @@ kept as constraints of each step: a joint that would leave its range stops there
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import in_pieces
+from grr_torch.pieces import one_thread, piece, slices
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import normalise
@@ -119,9 +120,8 @@ def project_columns(
     check_collision: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """`project` for columns: targets (width, N) and guesses (n, N) give configurations (n, N) and valid (N,)."""
-
-    def solve(targets: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-        solved, valid = _project(robot, task, targets, q, tolerances)
+    with torch.no_grad(), one_thread():
+        solved, valid = _converge(robot, task, targets, q, tolerances)
         solved = normalise(solved, robot.continuous[:, None])
         if check_collision and robot.spheres is not None:
             converged = valid.nonzero()[:, 0]
@@ -129,29 +129,77 @@ def project_columns(
             valid[converged[hit]] = False
         return torch.where(valid, solved, torch.nan), valid
 
-    with torch.no_grad():
-        solved, valid = in_pieces(solve, targets, q)
-    return solved, valid
+
+class _Batch(NamedTuple):
+    """Columns that have not converged.
+
+    Attributes:
+        rank: (M,) where their results belong.
+        targets: (width, M).
+        q: (n, M).
+        best: (M,) least squared error so far.
+    """
+
+    rank: Tensor
+    targets: Tensor
+    q: Tensor
+    best: Tensor
+
+    def take(self, columns: Tensor | slice) -> _Batch:
+        return _Batch(*(tensor[..., columns] for tensor in self))
 
 
-def _project(
+def _converge(
     robot: Robot, task: TaskSpace, targets: Tensor, q: Tensor, tolerances: Tolerances
 ) -> tuple[Tensor, Tensor]:
     """Configurations (n, N), NaN where not converged, and converged (N,).
 
+    After every few iterations, what the pieces of a long batch have left is put together.
+    """
+    limits = _limits(robot)
+    count = q.shape[1]
+    solved = torch.full_like(q, torch.nan)
+    valid = torch.zeros(count, dtype=torch.bool, device=q.device)
+    rank = torch.arange(count, device=q.device)
+    batch = _Batch(rank, targets, q if limits is None else q.clamp(*limits), torch.full_like(q[0], torch.inf))
+    workspace = robot.tree.workspace(q, min(count, piece(q.device)))
+    left = tolerances.iterations + 1
+    while left > 0 and len(batch.rank):
+        rounds = min(_PATIENCE, left)
+        left -= rounds
+        parts = [
+            _iterate(robot, task, batch.take(part), tolerances, rounds, left == 0, limits, workspace, solved, valid)
+            for part in slices(len(batch.rank), q.device)
+        ]
+        batch = (
+            parts[0] if len(parts) == 1 else _Batch(*(torch.cat(tensors, -1) for tensors in zip(*parts, strict=True)))
+        )
+    return solved, valid
+
+
+def _iterate(
+    robot: Robot,
+    task: TaskSpace,
+    batch: _Batch,
+    tolerances: Tolerances,
+    rounds: int,
+    last: bool,
+    limits: tuple[Tensor, Tensor] | None,
+    workspace: Tensor,
+    solved: Tensor,
+    valid: Tensor,
+) -> _Batch:
+    """Some iterations of a batch; writes what converged and gives what is left and has come nearer.
+
     What has converged stays in the batch, at no harm to itself, until it is a good part of it: to copy the rest each
     time costs more.
     """
-    limits = _limits(robot)
-    q = q if limits is None else q.clamp(*limits)
-    solved = torch.full_like(q, torch.nan)
-    valid = torch.zeros(q.shape[1], dtype=torch.bool, device=q.device)
-    active = torch.arange(q.shape[1], device=q.device)
-    waiting = torch.ones_like(valid)
-    best = last_best = torch.full_like(q[0], torch.inf)
+    rank, targets, q, before = batch
+    best = before
+    waiting = torch.ones_like(rank, dtype=torch.bool)
     rows = task.dimension
-    for iteration in range(tolerances.iterations + 1):
-        frames = robot.tree.frames(q)
+    for iteration in range(rounds):
+        frames = robot.tree.frames(q, workspace)
         error = task.error(targets, *robot.tree.tool_pose(frames))
         squared = error.square()
         translation, rotation = squared[:rows].sum(0), squared[rows:].sum(0)
@@ -160,25 +208,23 @@ def _project(
         best = torch.minimum(best, size)
         finished = (waiting & done).nonzero()[:, 0]
         if len(finished):
-            rank = active[finished]
-            solved[:, rank], valid[rank] = _take(q, finished), True
+            where = rank[finished]
+            solved[:, where], valid[where] = _take(q, finished), True
             waiting = waiting & ~done
-        if iteration % _PATIENCE == 0:
-            waiting = waiting & (best < 0.81 * last_best)
-            last_best = best
-        left = waiting.nonzero()[:, 0]
-        if len(left) == 0 or iteration == tolerances.iterations:
+            left = waiting.nonzero()[:, 0]
+            if len(left) < _LEFT * len(waiting):
+                rank, targets, q, error = rank[left], _take(targets, left), _take(q, left), _take(error, left)
+                best, before, size, frames = best[left], before[left], size[left], frames[..., left]
+                waiting = torch.ones_like(rank, dtype=torch.bool)
+        if len(rank) == 0 or (last and iteration == rounds - 1):
             break
-        if len(left) < _LEFT * len(waiting):
-            active, targets, q, error = active[left], _take(targets, left), _take(q, left), _take(error, left)
-            best, last_best, size, frames = best[left], last_best[left], size[left], frames[..., left]
-            waiting = torch.ones_like(active, dtype=torch.bool)
         jacobian = task.jacobian(robot.tree.jacobian(frames))
         if len(error) > rows:
             error[rows:].mul_(_ROTATION_LENGTH)
             jacobian[rows:].mul_(_ROTATION_LENGTH)
         q = _step(q, jacobian, error, size.mul(0.5 * _DAMPING).add_(_LEAST_DAMPING), limits)
-    return solved, valid
+    kept = (waiting & (best < 0.81 * before)).nonzero()[:, 0]
+    return _Batch(rank, targets, q, best).take(kept)
 
 
 def _step(q: Tensor, jacobian: Tensor, error: Tensor, damping: Tensor, limits: tuple[Tensor, Tensor] | None) -> Tensor:

@@ -61,18 +61,31 @@ class KinematicTree:
     path: tuple[int, ...]
     n: int
 
-    def frames(self, q: Tensor) -> Tensor:
-        """Poses (F, 4, 3, N) of all frames for configurations q (n, N); the last two are the tool and the base."""
+    def frames(self, q: Tensor, workspace: Tensor | None = None) -> Tensor:
+        """Poses (F, 4, 3, N) of all frames for configurations q (n, N); the last two are the tool and the base.
+
+        Args:
+            q: (n, N) configurations.
+            workspace: From `workspace`: where the result may be put, so that the next call with it overwrites it.
+        """
         if torch.is_grad_enabled() and q.requires_grad:
             return _Frames.apply(q, self)  # type: ignore[no-untyped-call]
-        return self._frames_of_few(q) if q.shape[1] <= _FEW else self._frames_of_many(q)
+        if q.shape[1] <= _FEW:
+            return self._frames_of_few(q)
+        return self._frames_of_many(q, self.workspace(q, q.shape[1]) if workspace is None else workspace)
 
-    def _frames_of_many(self, q: Tensor) -> Tensor:
+    def workspace(self, like: Tensor, width: int) -> Tensor:
+        """Memory for `frames` of up to `width` configurations; to ask the system for it each time takes longer."""
+        return like.new_empty((12 * (len(self.joints) + 2) + 18) * width)
+
+    def _frames_of_many(self, q: Tensor, workspace: Tensor) -> Tensor:
         """Joint by joint, parents first: 84 multiply-adds a joint and configuration, four passes, in place."""
         width, count = q.shape[1], len(self.joints)
         values = self._joint_values(q, self._joint_matrices[3][:count])
         cosines, sines = values.cos().unbind(0), values.sin().unbind(0)
-        frames, scratch = q.new_empty(count + 2, 4, 3, width), q.new_empty(6, 3, width)
+        size = 12 * (count + 2) * width
+        frames = workspace[:size].view(count + 2, 4, 3, width)
+        scratch = workspace[size : size + 18 * width].view(6, 3, width)
         frames[-1] = torch.eye(4, 3, dtype=q.dtype, device=q.device)[:, :, None]
         flat, at_zero = frames.view(count + 2, 4, 3 * width).unbind(0), scratch.view(6, 3 * width)
         turned, rest = (half.unbind(0) for half in frames.split(2, dim=1))

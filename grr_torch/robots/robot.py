@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import in_pieces
+from grr_torch.pieces import in_pieces, piece
 from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.presets import Preset
 from grr_torch.robots.self_collision import SphereKernel
@@ -105,7 +105,7 @@ class Robot:
         Raises:
             ParameterError: The last axis is not n.
         """
-        position, rotation = in_pieces(lambda part: self.tree.tool_pose(self.tree.frames(part)), self.columns(q))
+        position, rotation = self._of_frames(self.tree.tool_pose, self.columns(q))
         return _rows(position, q), _rows(rotation, q)
 
     def jacobian(self, q: Tensor) -> Tensor:
@@ -131,12 +131,10 @@ class Robot:
         Raises:
             ParameterError: The last axis is not n.
         """
-        position, rotation, jacobian = in_pieces(self._pose_and_jacobian, self.columns(q))
+        position, rotation, jacobian = self._of_frames(
+            lambda frames: (*self.tree.tool_pose(frames), self.tree.jacobian(frames)), self.columns(q)
+        )
         return _rows(position, q), _rows(rotation, q), _rows(jacobian, q)
-
-    def _pose_and_jacobian(self, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        frames = self.tree.frames(columns)
-        return *self.tree.tool_pose(frames), self.tree.jacobian(frames)
 
     def link_poses(self, q: Tensor) -> dict[str, Tensor]:
         """Poses T_base_link (*batch, 4, 4) of every link of the robot, also beside and beyond the chain.
@@ -148,13 +146,12 @@ class Robot:
             ParameterError: The last axis is not n.
         """
 
-        def poses(columns: Tensor) -> tuple[Tensor, ...]:
-            frames = self.tree.frames(columns)
-            bottom = columns.new_tensor([0.0, 0.0, 0.0, 1.0])[None, :, None].expand(1, 4, columns.shape[1])
+        def poses(frames: Tensor) -> tuple[Tensor, ...]:
+            bottom = frames.new_tensor([0.0, 0.0, 0.0, 1.0])[None, :, None].expand(1, 4, frames.shape[3])
             placed = (self.tree.link_pose(frames, link).transpose(0, 1) for link in self.tree.links)
             return tuple(torch.cat([pose, bottom]) for pose in placed)
 
-        placed = in_pieces(poses, self.columns(q))
+        placed = self._of_frames(poses, self.columns(q))
         return {link: _rows(pose, q) for link, pose in zip(self.tree.links, placed, strict=True)}
 
     def self_collision_distance(self, q: Tensor) -> Tensor:
@@ -171,7 +168,7 @@ class Robot:
         columns, kernel = self.columns(q), self._sphere_kernel
         if kernel is None:
             return columns.new_full(q.shape[:-1], math.inf)
-        (distances,) = in_pieces(lambda part: (kernel.distance(self.tree.frames(part)),), columns)
+        (distances,) = self._of_frames(lambda frames: (kernel.distance(frames),), columns)
         return distances.reshape(q.shape[:-1])
 
     def in_self_collision(self, q: Tensor) -> Tensor:
@@ -237,7 +234,12 @@ class Robot:
         kernel = self._sphere_kernel
         if kernel is None:
             return torch.zeros(columns.shape[1], dtype=torch.bool, device=columns.device)
-        return in_pieces(lambda part: (kernel.collides(self.tree.frames(part), self.margin),), columns)[0]
+        return self._of_frames(lambda frames: (kernel.collides(frames, self.margin),), columns)[0]
+
+    def _of_frames(self, function: Callable[[Tensor], tuple[Tensor, ...]], columns: Tensor) -> tuple[Tensor, ...]:
+        """What a function makes of the frames of columns (n, N), a piece at a time."""
+        workspace = self.tree.workspace(columns, min(columns.shape[1], piece(columns.device)))
+        return in_pieces(lambda part: function(self.tree.frames(part, workspace)), columns)
 
     @cached_property
     def _sphere_kernel(self) -> SphereKernel | None:
