@@ -83,6 +83,14 @@ def print_rows(title: str, rows: list[tuple[str, str]]) -> None:
         typer.echo(f"{name:{width}}  {value}")
 
 
+def _cells_row(name: str, quality: dict[str, Any]) -> tuple[str, str]:
+    return (
+        f"certified {name}",
+        f"{100.0 * quality[f'{name}_certified']:.2f} % of {quality[name]:,}; {quality[f'{name}_wound']} with a winding, "
+        f"{quality[f'{name}_spread']} spread by more than 1 rad",
+    )
+
+
 def markdown_table(head: list[str], rows: list[list[str]]) -> str:
     """A table that reads well as it is, and in a README."""
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
@@ -117,6 +125,8 @@ def quality_rows(quality: dict[str, Any]) -> list[tuple[str, str]]:
             "  median, 99 %, largest",
             ", ".join(number(f"smoothness_{which}", "").strip() for which in ("median", "p99", "max")),
         ),
+        ("edges steeper than 10 × median", str(quality["steep_edges"])),
+        *(_cells_row(name, quality) for name in ("triangles", "squares") if quality[name]),
         ("largest position error", number("max_position_error", "m", ".1e")),
         ("largest rotation error", number("max_rotation_error", "rad", ".1e")),
         (

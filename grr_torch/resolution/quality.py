@@ -6,12 +6,17 @@ import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from grr_torch.spaces.configuration import distance
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
+
+
+# slopes above so many times the median are suspect
+_STEEP = 10.0
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,15 @@ class Quality:
         smoothness_median: Median of the same ratios [rad/m].
         smoothness_p99: Their 99th percentile [rad/m].
         smoothness_max: The largest of them [rad/m].
+        steep_edges: Connected edges whose ratio is more than ten times the median: suspect.
+        triangles: Triangles of the graph with three connected edges.
+        triangles_wound: Those round which some joint makes a full turn.
+        triangles_spread: Others whose corners lead to configurations more than 1 rad apart at the centre.
+        triangles_certified: The rest, as a share.
+        squares: Faces of a spatial grid's cells with four connected edges.
+        squares_wound: As of triangles.
+        squares_spread: As of triangles.
+        squares_certified: As of triangles.
         max_position_error: Largest distance of a tool from its point [m].
         max_rotation_error: Largest angle of a tool from its rotation [rad]; 0 where rotation is free.
         min_self_collision_distance: Smallest distance of two links [m]; None without a sphere model.
@@ -54,6 +68,15 @@ class Quality:
     smoothness_median: float | None
     smoothness_p99: float | None
     smoothness_max: float | None
+    steep_edges: int
+    triangles: int
+    triangles_wound: int
+    triangles_spread: int
+    triangles_certified: float | None
+    squares: int
+    squares_wound: int
+    squares_spread: int
+    squares_certified: float | None
     max_position_error: float | None
     max_rotation_error: float | None
     min_self_collision_distance: float | None
@@ -91,12 +114,42 @@ def measure_quality(roadmap: Roadmap) -> Quality:
         smoothness_median=levels[0],
         smoothness_p99=levels[1],
         smoothness_max=levels[2],
+        steep_edges=len(steep_edges(roadmap)),
+        **_count_cells(roadmap),
         max_position_error=_largest(position_error),
         max_rotation_error=_largest(rotation_error),
         min_self_collision_distance=_clearance(roadmap, q),
         self_collisions=int(roadmap.robot.in_self_collision(q).sum()) if roadmap.robot.spheres else None,
         joint_limit_violations=int((~roadmap.robot.within_limits(q.to(roadmap.robot.lower))).sum()),
     )
+
+
+def steep_edges(roadmap: Roadmap, max_slope: float | None = None) -> Tensor:
+    """Indices (K,) of connected edges with D_q / D_p above `max_slope` [rad/m], the steepest first.
+
+    The paper's continuity check lets pass an edge between unrelated configurations that a self-motion joins; its slope
+    gives it away.
+
+    Args:
+        roadmap: The roadmap.
+        max_slope: Ten times the median by default.
+    """
+    slopes = edge_slopes(roadmap)
+    if len(slopes) == 0:
+        return torch.empty(0, dtype=torch.long)
+    limit = _STEEP * float(slopes.median()) if max_slope is None else max_slope
+    steep = (slopes > limit).nonzero()[:, 0]
+    return roadmap.connected.nonzero()[:, 0][steep[slopes[steep].argsort(descending=True)]]
+
+
+def _count_cells(roadmap: Roadmap) -> dict[str, Any]:
+    counts: dict[str, Any] = {}
+    for name, cells in zip(("triangles", "squares"), roadmap.cells(), strict=True):
+        counts[name] = len(cells.corners)
+        counts[f"{name}_wound"] = int(cells.wound.sum())
+        counts[f"{name}_spread"] = int(cells.spread_out.sum())
+        counts[f"{name}_certified"] = _ratio(int(cells.certified.sum()), len(cells.corners))
+    return counts
 
 
 def edge_slopes(roadmap: Roadmap) -> Tensor:

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from grr_torch.resolution.cells import Cells, measure_cells, squares, triangles
 from grr_torch.resolution.quality import Quality, measure_quality
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.graph import TaskGraph
+from grr_torch.spaces.graph import TaskGraph, find_lattice
 from grr_torch.spaces.task import TaskSpace
 
 if TYPE_CHECKING:
@@ -59,11 +60,24 @@ class Roadmap:
     @cached_property
     def graph(self) -> TaskGraph:
         """The task graph G_p."""
-        return TaskGraph(self.points, self.edges)
+        return TaskGraph(self.points, self.edges, find_lattice(self.points))
 
     def quality(self) -> Quality:
-        """Connectivity, smoothness, coverage and residuals, computed from the tensors."""
+        """Connectivity, smoothness, coverage, cells and residuals, computed once from the tensors."""
+        return self._quality
+
+    def cells(self) -> tuple[Cells, Cells]:
+        """The triangles of the roadmap, and in R³ the faces of its grid's cells, with their winding and spread."""
+        return self._cells
+
+    @cached_property
+    def _quality(self) -> Quality:
         return measure_quality(self)
+
+    @cached_property
+    def _cells(self) -> tuple[Cells, Cells]:
+        corners = triangles(self.edges[self.connected], len(self.points)), squares(self)
+        return measure_cells(self, corners[0]), measure_cells(self, corners[1])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the roadmap to one safetensors file (`.grr`), by an atomic rename.

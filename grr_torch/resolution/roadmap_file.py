@@ -29,7 +29,7 @@ from grr_torch.spaces.task import task_from_json
 from grr_torch.version import __version__
 
 FORMAT = "grr-torch roadmap"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 _DTYPES = {
     "points": torch.float64,

@@ -137,9 +137,7 @@ def staggered_grid(bounds: Bounds, n: int) -> TaskGraph:
     """
     pairs, n = check_bounds(bounds), check_count(n)
     cells = _cells([high - low for low, high in pairs], n)
-    lines = [np.linspace(low, high, count + 1) for (low, high), count in zip(pairs, cells, strict=True)]
-    middles = [0.5 * (line[1:] + line[:-1]) for line in lines]
-    points = np.concatenate([_mesh(lines), _mesh(middles)])
+    lattice, points = _lattice(pairs, cells)
     corner = np.arange(math.prod(count + 1 for count in cells)).reshape([count + 1 for count in cells])
     centre = corner.size + np.arange(math.prod(cells)).reshape(cells)
     edges: list[np.ndarray] = []
@@ -149,8 +147,25 @@ def staggered_grid(bounds: Bounds, n: int) -> TaskGraph:
     for shift in itertools.product((0, 1), repeat=len(cells)):
         window = tuple(slice(s, s + count) for s, count in zip(shift, cells, strict=True))
         edges.append(np.stack([corner[window].ravel(), centre.ravel()], axis=1))
+    return TaskGraph(points, torch.from_numpy(np.concatenate(edges)), lattice)
+
+
+def find_lattice(points: Tensor) -> Lattice | None:
+    """The arithmetic of points (V, d), if they are a staggered grid's in its order."""
+    axes = [np.unique(axis) for axis in points.numpy().T]
+    cells = tuple((len(axis) - 1) // 2 for axis in axes)
+    if min(cells) < 1 or math.prod(count + 1 for count in cells) + math.prod(cells) != len(points):
+        return None
+    lattice, expected = _lattice([(float(axis[0]), float(axis[-1])) for axis in axes], cells)
+    return lattice if torch.equal(points, expected) else None
+
+
+def _lattice(pairs: Bounds, cells: tuple[int, ...]) -> tuple[Lattice, Tensor]:
+    """A staggered grid's arithmetic and its points: corners, then centres."""
+    lines = [np.linspace(low, high, count + 1) for (low, high), count in zip(pairs, cells, strict=True)]
+    middles = [0.5 * (line[1:] + line[:-1]) for line in lines]
     spacing = tuple((high - low) / count for (low, high), count in zip(pairs, cells, strict=True))
-    return TaskGraph(torch.from_numpy(points), torch.from_numpy(np.concatenate(edges)), Lattice(cells, spacing))
+    return Lattice(cells, spacing), torch.from_numpy(np.concatenate([_mesh(lines), _mesh(middles)]))
 
 
 def random_graph(bounds: Bounds, n: int, *, k: int, generator: torch.Generator | None = None) -> TaskGraph:

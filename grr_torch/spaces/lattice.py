@@ -40,6 +40,19 @@ class Lattice:
         index = torch.where(to_centre, index + corners, index)
         return torch.where(inside, index, 0), torch.where(inside, lengths, torch.inf)
 
+    def faces(self) -> Tensor:
+        """(Q, 4) corners round every face of a cell, in space; in the plane, edges split all faces: (0, 4)."""
+        counts = [count + 1 for count in self.cells]
+        corner = torch.arange(math.prod(counts)).reshape(counts)
+        if len(counts) < 3:
+            return corner.new_empty(0, 4)
+        rings: list[Tensor] = []
+        for first, second in itertools.combinations(range(len(counts)), 2):
+            along = [corner.narrow(first, shift, self.cells[first]) for shift in (0, 1)]
+            low, high = ([part.narrow(second, s, self.cells[second]).flatten() for s in (0, 1)] for part in along)
+            rings.append(torch.stack([low[0], high[0], high[1], low[1]], dim=1))
+        return torch.cat(rings)
+
     def _coordinates(self, vertices: Tensor) -> list[Tensor]:
         """(F,) coordinates of vertices along each axis, in half cells."""
         corners = math.prod(count + 1 for count in self.cells)

@@ -1,0 +1,125 @@
+"""The cells of a roadmap: whether the map is continuous inside the smallest cycles of its graph, not only along edges.
+
+A map that is continuous inside a cell has winding zero round it: what its joints turn on the way along its edges adds
+up to nothing. The converse does not hold, so the corners' configurations are also led to the cell's centre and
+compared there. Neither asks where the configurations came from.
+
+Some windings cannot be removed. At full reach a planar arm is straight and its first joint turns with the target: once
+round the boundary it makes a full turn. The boundary's winding is the sum of its cells', so no map of the whole disc
+has none, and a planar roadmap has at least one cell with a winding.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.spaces.configuration import difference, distance
+
+if TYPE_CHECKING:
+    from grr_torch.resolution.roadmap import Roadmap
+
+# a cell is certified if its corners lead to configurations no farther apart than this [rad]
+LARGEST_SPREAD = 1.0
+# projections on the way from a corner to the centre
+_STEPS = 8
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells of one shape, all of whose corners are resolved and edges connected.
+
+    Attributes:
+        corners: (C, k) vertices, in their order round the cell; k = 3 or 4.
+        winding: (C, n) turns that each joint makes once round; only continuous joints can make any.
+        spread: (C,) largest distance D_q [rad] of the configurations that its corners lead to at its centre; inf where
+            a corner leads to none.
+    """
+
+    corners: Tensor
+    winding: Tensor
+    spread: Tensor
+
+    @property
+    def wound(self) -> Tensor:
+        """(C,) cells with a winding."""
+        return (self.winding != 0).any(1)
+
+    @property
+    def spread_out(self) -> Tensor:
+        """(C,) cells without winding whose spread is above 1 rad."""
+        return ~self.wound & ~(self.spread <= LARGEST_SPREAD)
+
+    @property
+    def certified(self) -> Tensor:
+        """(C,) all the others."""
+        return ~self.wound & ~self.spread_out
+
+
+def measure_cells(roadmap: Roadmap, corners: Tensor) -> Cells:
+    """Winding and spread of cells given by their corners (C, k)."""
+    robot = roadmap.robot
+    wraps = robot.continuous.cpu()
+    q = roadmap.configurations[corners]
+    turns = difference(q, q.roll(-1, dims=1), wraps).sum(1) / (2.0 * math.pi)
+    return Cells(corners, torch.where(wraps, turns.round(), 0.0).to(torch.int64), _spread(roadmap, corners))
+
+
+def triangles(edges: Tensor, vertices: int) -> Tensor:
+    """(C, 3) all triangles of a graph, smallest vertex first.
+
+    Args:
+        edges: (E, 2) edges.
+        vertices: How many vertices there are.
+    """
+    edges = edges.sort(dim=1).values
+    keys, order = (edges[:, 0] * vertices + edges[:, 1]).sort()
+    first, second = edges[order].unbind(1)
+    starts = torch.searchsorted(first.contiguous(), torch.arange(vertices + 1))
+    # of every edge (a, b), the edges (a, c) with c > b: is (b, c) one too?
+    counts = starts[first + 1] - torch.arange(len(first)) - 1
+    edge = torch.repeat_interleave(torch.arange(len(first)), counts)
+    beyond = edge + 1 + torch.arange(len(edge)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
+    closed = _are_edges(keys, second[edge] * vertices + second[beyond])
+    edge, beyond = edge[closed], beyond[closed]
+    return torch.stack([first[edge], second[edge], second[beyond]], dim=1)
+
+
+def squares(roadmap: Roadmap) -> Tensor:
+    """(C, 4) faces of a staggered grid in space all of whose edges are connected; none for other graphs."""
+    lattice, vertices = roadmap.graph.lattice, len(roadmap.points)
+    faces = torch.empty(0, 4, dtype=torch.long) if lattice is None else lattice.faces()
+    keys = (roadmap.edges[roadmap.connected] @ torch.tensor([vertices, 1])).sort().values
+    ends = torch.stack([faces, faces.roll(-1, dims=1)], dim=-1).sort(dim=-1).values
+    return faces[_are_edges(keys, ends @ torch.tensor([vertices, 1])).all(1)]
+
+
+def _are_edges(keys: Tensor, wanted: Tensor) -> Tensor:
+    """Which of the wanted keys are among the sorted ones."""
+    if len(keys) == 0:
+        return torch.zeros_like(wanted, dtype=torch.bool)
+    return keys[torch.searchsorted(keys, wanted).clamp(max=len(keys) - 1)] == wanted
+
+
+def _spread(roadmap: Roadmap, corners: Tensor) -> Tensor:
+    robot, task = roadmap.robot, roadmap.task
+    count, sides = corners.shape
+    points = roadmap.points[corners].to(robot.lower)
+    centre = points.mean(1, keepdim=True)
+    q = roadmap.configurations[corners].to(robot.lower).reshape(-1, robot.n).T.contiguous()
+    followed = torch.ones(q.shape[1], dtype=torch.bool, device=q.device)
+    tolerances = Tolerances(**roadmap.parameters["tolerances"])
+    for step in range(1, _STEPS + 1):
+        targets = task.interpolate(points, centre.expand_as(points), step / _STEPS).reshape(-1, task.width)
+        solved, valid = project_columns(robot, task, targets.T.contiguous(), q, tolerances, check_collision=False)
+        followed &= valid
+        q = torch.where(valid, solved, q)
+    ends = q.T.reshape(count, sides, robot.n)
+    pairs = torch.combinations(torch.arange(sides, device=q.device))
+    apart = distance(ends[:, pairs[:, 0]], ends[:, pairs[:, 1]], robot.continuous).amax(1)
+    return torch.where(followed.reshape(count, sides).all(1), apart, torch.inf).cpu()
