@@ -22,6 +22,9 @@ def build(
     out: Annotated[Path | None, typer.Option(help="Roadmap file; by default ROBOT.grr. Replaced if it exists.")] = None,
     record: Annotated[Path | None, typer.Option(help="Recording; by default beside the roadmap, .rrd.")] = None,
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
+    refine: Annotated[
+        bool, typer.Option("--refine/--no-refine", help="Repair, relax and certify the roadmap after the expansion.")
+    ] = True,
     reachability: Annotated[
         int, typer.Option(help="Random starts per unresolved vertex, to tell which are reachable; 0: not measured.")
     ] = 0,
@@ -55,6 +58,7 @@ def build(
     """
     from grr_torch.output import atomic_write, check_writable
     from grr_torch.resolution.build import build as build_roadmap
+    from grr_torch.resolution.refine import summary as refinement
     from grr_torch.resolution.seeds import read_seeds
     from grr_torch.robots.load import load_robot
 
@@ -87,6 +91,7 @@ def build(
             bounds=box,
             seeds=None if seeds == "preset" else read_seeds(seeds),
             neighbours=neighbours,
+            refine=refine,
             reachability=reachability,
             seed=seed,
             progress=progress,
@@ -101,7 +106,8 @@ def build(
 
                 record_roadmap(roadmap, stack.enter_context(atomic_write(recording)))
         progress("writing", 2, 2)
-    quality = roadmap.quality().to_dict()
+    figures = roadmap.quality()
+    quality = figures.to_dict()
     if as_json:
         files = {"out": str(out), "record": None if recording is None else str(recording)}
         print_json({**quality, "build_seconds": roadmap.build_seconds, **files})
@@ -110,7 +116,12 @@ def build(
     turned = "" if rotation is None else f", roll pitch yaw {' '.join(f'{angle:.4g}' for angle in rotation)} rad"
     title = f"{arm.name}, {roadmap.task.kind} in {roadmap.task.name}{turned}"
     written = str(out) if recording is None else f"{out}, {recording} (grr-torch view {out})"
-    rows = [("built in", f"{roadmap.build_seconds:.2f} s (the algorithm alone)"), ("written", written)]
+    change = refinement(roadmap, figures)
+    rows = [
+        *([("refined", change)] if change else []),
+        ("built in", f"{roadmap.build_seconds:.2f} s (the algorithm alone)"),
+        ("written", written),
+    ]
     print_rows(title, [*quality_rows(quality), *rows])
 
 

@@ -84,11 +84,9 @@ def print_rows(title: str, rows: list[tuple[str, str]]) -> None:
 
 
 def _cells_row(name: str, quality: dict[str, Any]) -> tuple[str, str]:
-    return (
-        f"certified {name}",
-        f"{100.0 * quality[f'{name}_certified']:.2f} % of {quality[name]:,}; {quality[f'{name}_wound']} with a winding, "
-        f"{quality[f'{name}_spread']} spread by more than 1 rad",
-    )
+    certified, wound, spread = (quality[f"{name}_{figure}"] for figure in ("certified", "wound", "spread"))
+    text = f"{100.0 * certified:.2f} % of {quality[name]:,}; {wound} with a winding, {spread} spread by more than 1 rad"
+    return f"certified {name}", text
 
 
 def markdown_table(head: list[str], rows: list[list[str]]) -> str:

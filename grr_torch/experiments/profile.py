@@ -47,9 +47,9 @@ def profile_build(robot: Robot, task: str) -> list[Stage]:
 
     The profiler itself costs something: the sum is more than a build takes.
     """
-    build(robot, task)
+    build(robot, task, refine=False)
     profiler = cProfile.Profile(builtins=False)
-    profiler.runcall(build, robot, task)
+    profiler.runcall(build, robot, task, refine=False)
     seconds = dict.fromkeys([*STAGES, "everything else"], 0.0)
     calls = dict.fromkeys(seconds, 0)
     package = Path(grr_torch.__file__).parent

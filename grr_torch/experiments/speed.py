@@ -211,8 +211,8 @@ def _builds(bench: _Bench) -> Iterator[Row]:
     for name in ("planar_5", "kinova"):
         robot = load_robot(name, device=bench.robot.device)
         for task in ("position", "fixed-rotation"):
-            seconds = bench.seconds(lambda robot=robot, task=task: build(robot, task), {})  # type: ignore[misc]
-            yield Row(f"build, {name} {task}", "s", seconds[""])
+            seconds = bench.seconds(lambda robot=robot, task=task: build(robot, task, refine=False), {})  # type: ignore[misc]
+            yield Row(f"build, {name} {task}, not refined", "s", seconds[""])
 
 
 def _processes(bench: _Bench) -> Iterator[Row]:
@@ -243,8 +243,8 @@ def _growth(bench: _Bench) -> Iterator[Row]:
 def _grow(points: int, device: str) -> tuple[int, float]:
     """How many vertices, and how long their build takes [s]."""
     robot = load_robot("kinova", device=device)
-    build(robot, "position")  # torch starts up
-    roadmap = build(robot, "position", points=points)
+    build(robot, "position", refine=False)  # torch starts up
+    roadmap = build(robot, "position", points=points, refine=False)
     return len(roadmap.points), roadmap.build_seconds
 
 

@@ -22,7 +22,19 @@ def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Te
     for column in others:
         normal.addcmul_(column[:, None], column)
     normal.diagonal(dim1=0, dim2=1).add_(damping[:, None])
-    return transposed_product(jacobian, solve_spd(normal, error))
+    return transposed_product(jacobian, solve_spd(normal, error[:, None])[:, 0])
+
+
+def null_space_projector(jacobian: Tensor, damping: float) -> Tensor:
+    """P (n, n, N) = 1 − Jᵀ (J Jᵀ + λ)⁻¹ J: what of a motion leaves the task alone."""
+    _, n, count = jacobian.shape
+    normal = (jacobian[:, None] * jacobian).sum(2)
+    normal.diagonal(dim1=0, dim2=1).add_(damping)
+    solved = solve_spd(normal, jacobian)
+    projector = torch.eye(n, dtype=jacobian.dtype, device=jacobian.device)[..., None].repeat(1, 1, count)
+    for row, factors in zip(jacobian, solved, strict=True):
+        projector.addcmul_(row[:, None], factors, value=-1.0)
+    return projector
 
 
 def transposed_product(jacobian: Tensor, right: Tensor) -> Tensor:
@@ -34,21 +46,21 @@ def transposed_product(jacobian: Tensor, right: Tensor) -> Tensor:
 
 
 def solve_spd(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solves A x = b for N symmetric positive definite systems at once, by Gauss–Jordan elimination.
+    """Solves A X = B for N symmetric positive definite systems at once, by Gauss–Jordan elimination.
 
     A positive definite system needs no pivoting. Every step clears one column above and below its pivot at once, so
-    it takes six calls a row, and m³/2 + m² multiply-adds a system.
+    it takes six calls a row, and m³/2 + k m² multiply-adds a system.
 
     Args:
         matrix: (m, m, N) A.
-        right: (m, N) b.
+        right: (m, k, N) B.
 
     Returns:
-        (m, N) solutions.
+        (m, k, N) solutions.
     """
     m = len(matrix)
-    block = torch.cat([matrix, right[:, None]], dim=1)
-    for columns_left in range(m, 0, -1):
+    block = torch.cat([matrix, right], dim=1)
+    for columns_left in range(block.shape[1] - 1, right.shape[1] - 1, -1):
         column, others = block.split_with_sizes((1, columns_left), 1)
         pivot, factors = column.split_with_sizes((1, m - 1))
         row, rest = others.split_with_sizes((1, m - 1))
@@ -57,4 +69,4 @@ def solve_spd(matrix: Tensor, right: Tensor) -> Tensor:
         cleared, last = block.split_with_sizes((m - 1, 1))
         torch.div(row, pivot, out=last)
         torch.addcmul(rest, factors, last, value=-1.0, out=cleared)
-    return block[:, 0]
+    return block

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
 from grr_torch.resolution.expand import default_neighbours, expand
 from grr_torch.resolution.reachability import measure_reachability, reach, within_reach
+from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.seeds import SeedsLike
 from grr_torch.robots.robot import Robot
@@ -34,12 +35,13 @@ def build(
     bounds: Bounds | None = None,
     seeds: SeedsLike | None = None,
     neighbours: int | None = None,
+    refine: bool = True,
     reachability: int = 0,
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
     progress: Progress = silent,
 ) -> Roadmap:
-    """Builds a roadmap with Expansion-GRR.
+    """Builds a roadmap with Expansion-GRR, and refines it.
 
     Whatever is not given is taken from the preset of a bundled robot; without one, task, bounds, points and seeds
     must be given.
@@ -51,6 +53,7 @@ def build(
         bounds: (low, high) of each axis of the grid [m].
         seeds: (S, n) configurations that the expansion starts from.
         neighbours: How many of the nearest vertices are averaged over; 24 in the plane and 64 in space by default.
+        refine: Whether the roadmap is repaired, relaxed and certified after the expansion.
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. The same inputs give the same tensors.
         tolerances: When a configuration counts as being at a point.
@@ -73,29 +76,16 @@ def build(
     expansion = expand(robot, task, graph, seeds, neighbours=neighbours, tolerances=tolerances, progress=progress)
     connected = _connected(robot, task, graph, expansion.configurations, expansion.resolved, tolerances, progress)
     seconds = time.perf_counter() - begin
-    resolved = expansion.resolved.cpu()
-    reachable = None
-    if reachability:
-        reachable = resolved.clone()
-        reachable[~resolved] = measure_reachability(
-            robot,
-            task,
-            graph.points[~resolved],
-            reachability,
-            seed=seed,
-            tolerances=tolerances,
-            progress=progress,
-        )
-    return Roadmap(
+    roadmap = Roadmap(
         robot=robot,
         task=task,
         points=graph.points,
         configurations=expansion.configurations.cpu(),
-        resolved=resolved,
+        resolved=expansion.resolved.cpu(),
         edges=graph.edges,
         connected=connected.cpu(),
         wave=expansion.wave.cpu(),
-        reachable=reachable,
+        reachable=None,
         parameters={
             "method": "expansion",
             "neighbours": default_neighbours(task) if neighbours is None else neighbours,
@@ -109,6 +99,16 @@ def build(
         },
         build_seconds=seconds,
     )
+    if refine:
+        roadmap = refine_roadmap(roadmap, seed=seed, progress=progress)
+    if not reachability:
+        return roadmap
+    left = ~roadmap.resolved
+    reachable = roadmap.resolved.clone()
+    reachable[left] = measure_reachability(
+        robot, task, graph.points[left], reachability, seed=seed, tolerances=tolerances, progress=progress
+    )
+    return replace(roadmap, reachable=reachable)
 
 
 def check_task(robot: Robot, task: TaskSpace) -> None:

@@ -23,6 +23,8 @@ from grr_torch.spaces.configuration import difference, distance
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
+    from grr_torch.robots.robot import Robot
+    from grr_torch.spaces.task import TaskSpace
 
 # a cell is certified if its corners lead to configurations no farther apart than this [rad]
 LARGEST_SPREAD = 1.0
@@ -106,20 +108,37 @@ def _are_edges(keys: Tensor, wanted: Tensor) -> Tensor:
     return keys[torch.searchsorted(keys, wanted).clamp(max=len(keys) - 1)] == wanted
 
 
-def _spread(roadmap: Roadmap, corners: Tensor) -> Tensor:
-    robot, task = roadmap.robot, roadmap.task
-    count, sides = corners.shape
-    points = roadmap.points[corners].to(robot.lower)
-    centre = points.mean(1, keepdim=True)
-    q = roadmap.configurations[corners].to(robot.lower).reshape(-1, robot.n).T.contiguous()
-    followed = torch.ones(q.shape[1], dtype=torch.bool, device=q.device)
-    tolerances = Tolerances(**roadmap.parameters["tolerances"])
+def lead_to_centres(
+    robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances
+) -> tuple[Tensor, Tensor]:
+    """Follows the straight lines from the corners of cells to their centres.
+
+    Args:
+        robot: The robot.
+        task: The task space.
+        points: (C, k, width) corners.
+        q: (C, k, n) configurations there.
+        tolerances: Of the projections.
+
+    Returns:
+        Configurations (C, k, n) at the centres, and where all corners of a cell led to one (C,).
+    """
+    count, sides, _ = points.shape
+    centre = points.mean(1, keepdim=True).expand_as(points)
+    columns = q.reshape(-1, robot.n).T.contiguous()
+    followed = torch.ones(columns.shape[1], dtype=torch.bool, device=columns.device)
     for step in range(1, _STEPS + 1):
-        targets = task.interpolate(points, centre.expand_as(points), step / _STEPS).reshape(-1, task.width)
-        solved, valid = project_columns(robot, task, targets.T.contiguous(), q, tolerances, check_collision=False)
+        targets = task.interpolate(points, centre, step / _STEPS).reshape(-1, task.width).T.contiguous()
+        solved, valid = project_columns(robot, task, targets, columns, tolerances, check_collision=False)
         followed &= valid
-        q = torch.where(valid, solved, q)
-    ends = q.T.reshape(count, sides, robot.n)
-    pairs = torch.combinations(torch.arange(sides, device=q.device))
+        columns = torch.where(valid, solved, columns)
+    return columns.T.reshape(count, sides, robot.n), followed.reshape(count, sides).all(1)
+
+
+def _spread(roadmap: Roadmap, corners: Tensor) -> Tensor:
+    robot = roadmap.robot
+    points, q = (part[corners].to(robot.lower) for part in (roadmap.points, roadmap.configurations))
+    ends, followed = lead_to_centres(robot, roadmap.task, points, q, Tolerances(**roadmap.parameters["tolerances"]))
+    pairs = torch.combinations(torch.arange(corners.shape[1], device=q.device))
     apart = distance(ends[:, pairs[:, 0]], ends[:, pairs[:, 1]], robot.continuous).amax(1)
-    return torch.where(followed.reshape(count, sides).all(1), apart, torch.inf).cpu()
+    return torch.where(followed, apart, torch.inf).cpu()

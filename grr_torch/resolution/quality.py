@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 # slopes above so many times the median are suspect
-_STEEP = 10.0
+STEEP = 10.0
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def steep_edges(roadmap: Roadmap, max_slope: float | None = None) -> Tensor:
     slopes = edge_slopes(roadmap)
     if len(slopes) == 0:
         return torch.empty(0, dtype=torch.long)
-    limit = _STEEP * float(slopes.median()) if max_slope is None else max_slope
+    limit = STEEP * float(slopes.median()) if max_slope is None else max_slope
     steep = (slopes > limit).nonzero()[:, 0]
     return roadmap.connected.nonzero()[:, 0][steep[slopes[steep].argsort(descending=True)]]
 

@@ -1,0 +1,151 @@
+"""Relaxation of a roadmap: all configurations move at once, each along its self-motion manifold.
+
+The sum of D_q / D_p over the edges is minimised under the constraint that every tool stays where it is. Each round
+is one Gauss–Newton step: around the present configurations, the sum of the edges' weighted squares over all motions
+that the null spaces of the Jacobians allow is minimised by conjugate gradients. The weights 1 / (D_p · D_q) make
+its squares stand for the norms themselves (iteratively reweighted least squares).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from grr_torch.pieces import one_thread
+from grr_torch.progress import Progress
+from grr_torch.projection.columns import null_space_projector
+from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.configuration import difference, normalise
+from grr_torch.spaces.task import TaskSpace
+
+_ROUNDS = 40
+# rounds end when one lowers the cost by less than this share
+_LEAST_GAIN = 2e-5
+_GRADIENT_STEPS = 60
+# longest step of a joint [rad or m]
+_LONGEST_STEP = 0.3
+# D_q below which a slope counts as none [rad]
+_SHORTEST = 1e-2
+# λ of the null-space projectors
+_LEAST_DAMPING = 1e-9
+
+
+@dataclass(frozen=True)
+class Network:
+    """Vertices on their self-motion manifolds, and the edges that pull at them.
+
+    Attributes:
+        robot: The robot.
+        task: The task space.
+        targets: (width, V) points.
+        edges: (2, E) vertices of each edge.
+        lengths: (E,) D_p of each edge.
+    """
+
+    robot: Robot
+    task: TaskSpace
+    targets: Tensor
+    edges: Tensor
+    lengths: Tensor
+
+    def motions(self, q: Tensor) -> Tensor:
+        """(n, E) wrapped differences along the edges."""
+        first, second = self.edges
+        return difference(q[:, first], q[:, second], self.robot.continuous[:, None])
+
+    def cost(self, q: Tensor) -> float:
+        """Sum of D_q / D_p, rounded off at zero, for configurations (n, V)."""
+        squared = self.motions(q).square().sum(0)
+        return float(((squared + _SHORTEST**2).sqrt() / self.lengths).sum())
+
+
+class Pulls(NamedTuple):
+    """Pairs of vertices that are to come nearer along a given direction.
+
+    Attributes:
+        pairs: (2, K) vertices.
+        motions: (n, K) from the first to the second, wrapped.
+        weights: (K,) how much a square counts.
+    """
+
+    pairs: Tensor
+    motions: Tensor
+    weights: Tensor
+
+
+def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progress) -> Tensor:
+    """Configurations (n, V) of lower cost: converged, within limits and free of self-collision like those given."""
+    damping, cost = 1e-2, network.cost(q)
+    with one_thread(), torch.no_grad():
+        for done in range(_ROUNDS):
+            progress("refining", done, _ROUNDS)
+            moved = move(network, q, gauss_newton_step(network, q, damping), tolerances)
+            new_cost = network.cost(moved)
+            if new_cost < cost:
+                gain = 1.0 - new_cost / cost
+                q, cost, damping = moved, new_cost, max(0.3 * damping, 1e-4)
+                if gain < _LEAST_GAIN:
+                    break
+            else:
+                damping *= 10.0
+                if damping > 1e3:
+                    break
+    progress("refining", _ROUNDS, _ROUNDS)
+    return q
+
+
+def gauss_newton_step(network: Network, q: Tensor, damping: float, pulls: Pulls | None = None) -> Tensor:
+    """A step (n, V) that lowers the edges' slopes and the pulls, by preconditioned conjugate gradients."""
+    robot = network.robot
+    motions = network.motions(q)
+    weights = 1.0 / ((motions.square().sum(0) + _SHORTEST**2).sqrt() * network.lengths)
+    jacobian = network.task.jacobian(robot.tree.jacobian(robot.tree.frames(q)))
+    projector = null_space_projector(jacobian, _LEAST_DAMPING)
+    edges = network.edges
+    if pulls is not None:
+        edges = torch.cat([edges, pulls.pairs], dim=1)
+        motions, weights = torch.cat([motions, pulls.motions], dim=1), torch.cat([weights, pulls.weights])
+    first, second = edges
+    stiffness = weights.new_zeros(q.shape[1]).index_add_(0, first, weights).index_add_(0, second, weights)
+    # a vertex without edges stays
+    stiffness = torch.where(stiffness > 0.0, stiffness, 1.0)
+
+    def gather(forces: Tensor) -> Tensor:
+        return torch.zeros_like(q).index_add_(1, second, -forces).index_add_(1, first, forces)
+
+    def allowed(x: Tensor) -> Tensor:
+        return (projector * x).sum(1)
+
+    def apply(x: Tensor) -> Tensor:
+        return allowed(gather(weights * (x[:, first] - x[:, second]))) + damping * stiffness * x
+
+    step = torch.zeros_like(q)
+    residual = allowed(gather(weights * motions))
+    direction = scaled = residual / stiffness
+    size = start = (residual * scaled).sum()
+    for _ in range(_GRADIENT_STEPS):
+        if float(size) <= 1e-6 * float(start):
+            break
+        applied = apply(direction)
+        length = size / (direction * applied).sum()
+        step = torch.add(step, direction * length)
+        residual = residual - applied * length
+        scaled = allowed(residual / stiffness)
+        before, size = size, (residual * scaled).sum()
+        direction = scaled + direction * (size / before)
+    return step * (_LONGEST_STEP / step.abs().amax(0).clamp_min(_LONGEST_STEP))
+
+
+def move(network: Network, q: Tensor, step: Tensor, tolerances: Tolerances) -> Tensor:
+    """Configurations after a step; those that cannot be projected near where it leads stay."""
+    robot = network.robot
+    wraps = robot.continuous[:, None]
+    aim = normalise(q + step, wraps)
+    moved, valid = project_columns(robot, network.task, network.targets, aim, tolerances)
+    missed = difference(aim, moved, wraps).square().sum(0).sqrt()
+    near = missed <= 0.5 * step.square().sum(0).sqrt() + 1e-3
+    return torch.where(valid & near, moved, q)
