@@ -10,6 +10,7 @@ import typer
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
 if TYPE_CHECKING:
+    from grr_torch.experiments.roadmaps import Result
     from grr_torch.experiments.speed import Row, SpeedTable
 
 app = typer.Typer(name="bench", help="Measure: the tables of the README.", no_args_is_help=True)
@@ -68,6 +69,67 @@ def speed(
         with atomic_write(json_file) as path:
             path.write_text(json.dumps(table.to_dict(), indent=2, ensure_ascii=False), encoding="utf-8")
     _show_speed(table)
+
+
+@app.command()
+@reports_errors
+def roadmap(
+    robot: Annotated[list[str] | None, typer.Option(help="planar_5 or kinova; repeatable; both by default.")] = None,
+    method: Annotated[
+        list[str] | None, typer.Option(help="random, preset or auto (seeds); repeatable; all by default.")
+    ] = None,
+    reachability: Annotated[int, typer.Option(min=1, help="Random starts a vertex: which are reachable?")] = 40,
+    samples: Annotated[int, typer.Option(min=1, help="Random configurations a vertex, for random.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+) -> None:
+    """Print the quality of the paper's four problems by every method, as a Markdown table.
+
+    The method random takes minutes a problem.
+
+    Example: grr-torch bench roadmap --method preset --method auto
+    """
+    from grr_torch.experiments.roadmaps import measure_roadmaps
+    from grr_torch.experiments.timing import machine
+    from grr_torch.output import atomic_write, check_writable
+
+    if json_file is not None:
+        check_writable(json_file)
+    with progress_bar() as progress:
+        results = measure_roadmaps(
+            robots=robot, methods=method, reachability=reachability, samples=samples, seed=seed, progress=progress
+        )
+    if json_file is not None:
+        with atomic_write(json_file) as path:
+            data = {"machine": machine(), "roadmaps": [result.to_dict() for result in results]}
+            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
+    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    head = ["problem", "method", "resolved / reachable", "connected / edges", "smoothness", "99 %, largest slope"]
+    head += ["certified triangles", "squares", "time [s]", "the paper: connectivity, smoothness, time"]
+    typer.echo(markdown_table(head, [_roadmap_row(result) for result in results]))
+
+
+def _roadmap_row(result: Result) -> list[str]:
+    quality, paper = result.quality, result.paper
+
+    def share(value: float | None) -> str:
+        return "" if value is None else f"{100.0 * value:.2f} %"
+
+    def number(value: float | None, digits: int) -> str:
+        return "none" if value is None else f"{value:.{digits}f}"
+
+    return [
+        f"{result.robot} {result.task}",
+        f"{result.method}{', refined' if result.refined else ''}",
+        f"{quality.resolved_vertices:,} / {quality.reachable_vertices:,}",
+        f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({share(quality.connectivity)})",
+        number(quality.smoothness, 3),
+        f"{number(quality.smoothness_p99, 1)}, {number(quality.smoothness_max, 1)}",
+        share(quality.triangles_certified),
+        share(quality.squares_certified),
+        f"{result.seconds:.2f}",
+        "" if paper is None else f"{paper[0]} %, {paper[1]}, {60.0 * paper[2]:.0f} s",
+    ]
 
 
 def _show_speed(table: SpeedTable) -> None:

@@ -18,7 +18,14 @@ def build(
     robot: Annotated[str, typer.Option(help="A bundled robot (grr-torch robots) or the path of a URDF.")],
     task: Annotated[str | None, typer.Option(help="position or fixed-rotation; the preset's default.")] = None,
     points: Annotated[int | None, typer.Option(help="Vertices that the staggered grid is asked for.")] = None,
-    seeds: Annotated[str, typer.Option(help="preset, or a .csv, .txt or .npy FILE, one seed a row.")] = "preset",
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            help="preset, auto (found), or a .csv, .txt or .npy FILE, one seed a row; preset if there is one."
+        ),
+    ] = None,
+    method: Annotated[str, typer.Option(help="expansion, or random: the baseline, in minutes.")] = "expansion",
+    samples: Annotated[int, typer.Option(help="Random configurations of a vertex, for --method random.")] = 100,
     out: Annotated[Path | None, typer.Option(help="Roadmap file; by default ROBOT.grr. Replaced if it exists.")] = None,
     record: Annotated[Path | None, typer.Option(help="Recording; by default beside the roadmap, .rrd.")] = None,
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
@@ -59,7 +66,6 @@ def build(
     from grr_torch.output import atomic_write, check_writable
     from grr_torch.resolution.build import build as build_roadmap
     from grr_torch.resolution.refine import summary as refinement
-    from grr_torch.resolution.seeds import read_seeds
     from grr_torch.robots.load import load_robot
 
     with progress_bar() as progress:
@@ -89,7 +95,9 @@ def build(
             _task(arm, task, box, rotation),
             points=points,
             bounds=box,
-            seeds=None if seeds == "preset" else read_seeds(seeds),
+            seeds=_seeds(arm, seeds),
+            method=method,
+            samples=samples,
             neighbours=neighbours,
             refine=refine,
             reachability=reachability,
@@ -123,6 +131,17 @@ def build(
         ("written", written),
     ]
     print_rows(title, [*quality_rows(quality), *rows])
+
+
+def _seeds(arm: Any, seeds: str | None) -> Any:
+    """What `build` takes for --seeds."""
+    from grr_torch.resolution.seeds import read_seeds
+
+    if seeds == "preset" and arm.preset is None:
+        raise ParameterError("--seeds", "preset", f"auto or a file: {arm.name} has no preset")
+    if seeds in (None, "preset", "auto"):
+        return "auto" if seeds == "auto" else None
+    return read_seeds(seeds)
 
 
 def _keep_inputs(out: Path, record: Path | None, inputs: Sequence[str | Path | None]) -> None:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import time
 import warnings
 from dataclasses import asdict, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from grr_torch.errors import GrrWarning, ParameterError, SeedError, UnknownNameError, check_seed
+from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
-from grr_torch.resolution.expand import default_neighbours, expand
+from grr_torch.resolution.auto_seeds import find_seeds
+from grr_torch.resolution.expand import Expansion, default_neighbours, expand
+from grr_torch.resolution.random_grr import random_grr
 from grr_torch.resolution.reachability import measure_reachability, reach, within_reach
 from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
@@ -33,26 +36,30 @@ def build(
     *,
     points: int | TaskGraph | None = None,
     bounds: Bounds | None = None,
-    seeds: SeedsLike | None = None,
+    seeds: SeedsLike | str | None = None,
+    method: str = "expansion",
     neighbours: int | None = None,
+    samples: int = 100,
     refine: bool = True,
     reachability: int = 0,
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
     progress: Progress = silent,
 ) -> Roadmap:
-    """Builds a roadmap with Expansion-GRR, and refines it.
+    """Builds a roadmap with Expansion-GRR, or with the baseline Random-GRR, and refines it.
 
-    Whatever is not given is taken from the preset of a bundled robot; without one, task, bounds, points and seeds
-    must be given.
+    Whatever is not given is taken from the preset of a bundled robot; without one, task, bounds and points must be
+    given, and seeds are found.
 
     Args:
         robot: The robot.
         task: The task space, or the kind of one that the preset has.
         points: How many vertices a staggered grid over `bounds` is asked for, or a task graph.
         bounds: (low, high) of each axis of the grid [m].
-        seeds: (S, n) configurations that the expansion starts from.
+        seeds: (S, n) configurations that the expansion starts from, or "auto": they are found.
+        method: "expansion", or "random": random configurations at every vertex and a constraint solver.
         neighbours: How many of the nearest vertices are averaged over; 24 in the plane and 64 in space by default.
+        samples: Random configurations of a vertex, for the method "random".
         refine: Whether the roadmap is repaired, relaxed and certified after the expansion.
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. The same inputs give the same tensors.
@@ -66,15 +73,31 @@ def build(
         ParameterError: Something is missing or out of its range, or no point lies within the arm's reach.
         SeedError: No seed can be used.
     """
-    task, graph, seeds = _problem(robot, task, points, bounds, seeds)
+    task, graph, given = _problem(robot, task, points, bounds, seeds)
     check_task(robot, task)
     _check_reach(robot, task, graph)
     check_seed(seed)
     if not 0 <= reachability <= _MOST_STARTS:
         raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
+    if method not in ("expansion", "random"):
+        raise UnknownNameError("method", method, ("expansion", "random"))
     begin = time.perf_counter()
-    expansion = expand(robot, task, graph, seeds, neighbours=neighbours, tolerances=tolerances, progress=progress)
-    connected = _connected(robot, task, graph, expansion.configurations, expansion.resolved, tolerances, progress)
+    if method == "random":
+        found = random_grr(robot, task, graph, samples=samples, seed=seed, tolerances=tolerances, progress=progress)
+        expansion, connected = Expansion(found.configurations, found.wave), found.connected
+        chosen: dict[str, Any] = {"samples": samples, "seeds": []}
+    else:
+        table = (
+            find_seeds(robot, task, graph, seed=seed, tolerances=tolerances, progress=progress)
+            if isinstance(given, str)
+            else given
+        )
+        expansion = expand(robot, task, graph, table, neighbours=neighbours, tolerances=tolerances, progress=progress)
+        connected = _connected(robot, task, graph, expansion.configurations, expansion.resolved, tolerances, progress)
+        chosen = {
+            "neighbours": default_neighbours(task) if neighbours is None else neighbours,
+            "seeds": torch.as_tensor(table, dtype=torch.float64).tolist(),
+        }
     seconds = time.perf_counter() - begin
     roadmap = Roadmap(
         robot=robot,
@@ -87,9 +110,8 @@ def build(
         wave=expansion.wave.cpu(),
         reachable=None,
         parameters={
-            "method": "expansion",
-            "neighbours": default_neighbours(task) if neighbours is None else neighbours,
-            "seeds": torch.as_tensor(seeds, dtype=torch.float64).tolist(),
+            "method": method,
+            **chosen,
             "points": len(graph.points),
             "bounds": torch.stack([graph.points.amin(0), graph.points.amax(0)], dim=1).tolist(),
             "margin": robot.margin,
@@ -148,8 +170,8 @@ def _problem(
     task: TaskSpace | str | None,
     points: int | TaskGraph | None,
     bounds: Bounds | None,
-    seeds: SeedsLike | None,
-) -> tuple[TaskSpace, TaskGraph, SeedsLike]:
+    seeds: SeedsLike | str | None,
+) -> tuple[TaskSpace, TaskGraph, SeedsLike | str]:
     """Task, graph and seeds, with what was not given taken from the robot's preset."""
     preset = robot.preset
     kind = task.kind if isinstance(task, TaskSpace) else task or (preset.default_task if preset else None)
@@ -165,9 +187,9 @@ def _problem(
         raise ParameterError(missing, "nothing", f"they must be given for {robot.name}, which has no preset for this")
     graph = points if isinstance(points, TaskGraph) else staggered_grid(bounds or (), points)
     if seeds is None:
-        if problem is None:
-            raise SeedError(f"no seeds were given (--seeds FILE), and {robot.name} has no preset for this task")
-        seeds = problem.seeds
+        seeds = "auto" if problem is None else problem.seeds
+    if isinstance(seeds, str) and seeds != "auto":
+        raise UnknownNameError("seeds", seeds, ("auto",), " Or a table of configurations.")
     if not isinstance(task, TaskSpace):
         if kind is None:
             raise ParameterError("task", "not given", "'position' or 'fixed-rotation'")

@@ -76,6 +76,22 @@ def expand(
         neighbours = default_neighbours(task)
     if neighbours < 1:
         raise ParameterError("neighbours", neighbours, "1 or more")
+    vertices, placed = place_seeds(robot, task, graph, check_seeds(robot, seeds), tolerances)
+    return grow(robot, task, graph, vertices, placed, neighbours=neighbours, tolerances=tolerances, progress=progress)
+
+
+def grow(
+    robot: Robot,
+    task: TaskSpace,
+    graph: TaskGraph,
+    found: Tensor,
+    placed: Tensor,
+    *,
+    neighbours: int,
+    tolerances: Tolerances,
+    progress: Progress = silent,
+) -> Expansion:
+    """`expand` from vertices `found` (K,) that have configurations `placed` (K, n)."""
     count = len(graph.points)
     configurations = torch.full((count, robot.n), torch.nan, dtype=robot.dtype, device=robot.device)
     wave = torch.full((count,), -1, dtype=torch.int32, device=robot.device)
@@ -85,7 +101,6 @@ def expand(
     targets = graph.points.to(device=robot.device, dtype=robot.dtype).T.contiguous()
     candidates = within_reach(robot, task, graph.points).to(robot.device)
     waiting = torch.zeros_like(candidates)
-    found, placed = place_seeds(robot, task, graph, check_seeds(robot, seeds), tolerances)
     for current in itertools.count():
         configurations[found], wave[found], candidates[found] = placed, current, False
         embedded[found] = embed(placed, robot.continuous)

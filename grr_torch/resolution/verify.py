@@ -12,6 +12,9 @@ from grr_torch.resolution.build import check_edges
 from grr_torch.resolution.quality import quality_differences
 from grr_torch.resolution.roadmap_file import load_roadmap, metadata_hash, read_file, tensors_hash
 
+# angles are wrapped after they were found good
+_ROUNDING = 1.0 + 1e-6
+
 
 @dataclass(frozen=True)
 class Check:
@@ -59,7 +62,7 @@ def verify_file(path: str | os.PathLike[str], *, progress: Progress = silent) ->
         Check("quality", not differing, f"differs in {', '.join(differing)}" if differing else "as stored"),
         Check(
             "residuals",
-            position <= tolerances.position and rotation <= tolerances.rotation,
+            position <= _ROUNDING * tolerances.position and rotation <= _ROUNDING * tolerances.rotation,
             f"at most {position:.2e} m and {rotation:.2e} rad",
         ),
         Check("joint limits", not quality.joint_limit_violations, f"{quality.joint_limit_violations} violations"),

@@ -90,6 +90,31 @@ class TaskGraph:
         return torch.from_numpy(rows.indptr.astype(np.int64)), torch.from_numpy(rows.indices.astype(np.int64))
 
 
+@dataclass(frozen=True, eq=False)
+class Copies(TaskGraph):
+    """Several copies of a graph, one after the other, with nothing between them: many expansions at once.
+
+    Attributes:
+        base: The graph that is copied.
+    """
+
+    base: TaskGraph | None = None
+
+    @staticmethod
+    def of(base: TaskGraph, count: int) -> Copies:
+        """`count` copies of a graph."""
+        shifts = torch.arange(count)[:, None, None] * len(base.points)
+        edges = (base.edges[None] + shifts).reshape(-1, 2)
+        return Copies(base.points.repeat(count, 1), edges, base.lattice, base)
+
+    def neighbours(self, vertices: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """As of the graph that is copied."""
+        assert self.base is not None
+        size = len(self.base.points)
+        indices, distances = self.base.neighbours(vertices % size, k)
+        return indices + (vertices - vertices % size)[:, None], distances
+
+
 def _some_coincide(points: np.ndarray) -> bool:
     ordered = points[np.lexsort(points.T)]
     return bool((ordered[1:] == ordered[:-1]).all(1).any())

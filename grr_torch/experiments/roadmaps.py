@@ -1,0 +1,104 @@
+"""The paper's Table I, and beyond: its four problems by every method, plain and refined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from grr_torch.errors import UnknownNameError
+from grr_torch.progress import Progress, silent
+from grr_torch.resolution.build import build
+from grr_torch.resolution.quality import Quality
+from grr_torch.resolution.refine import refine
+from grr_torch.robots.load import load_robot
+
+PROBLEMS = tuple((robot, task) for robot in ("planar_5", "kinova") for task in ("position", "fixed-rotation"))
+METHODS = ("random", "preset", "auto")
+# the paper's Table I: connectivity [%], smoothness [rad/m] and build time [min], by problem and method
+PAPER = {
+    ("planar_5", "position"): {"random": (100, 16.853, 2.023), "preset": (100, 5.675, 0.095)},
+    ("planar_5", "fixed-rotation"): {"random": (100, 24.528, 1.862), "preset": (100, 8.992, 0.150)},
+    ("kinova", "position"): {"random": (100, 9.223, 22.971), "preset": (100, 2.563, 0.201)},
+    ("kinova", "fixed-rotation"): {"random": (100, 11.205, 72.013), "preset": (100, 4.299, 0.196)},
+}
+
+
+@dataclass(frozen=True)
+class Result:
+    """One roadmap.
+
+    Attributes:
+        robot: The bundled robot.
+        task: The kind of task.
+        method: Of `METHODS`: random is Random-GRR, the others are Expansion-GRR with the seeds of that name.
+        refined: Whether it was refined.
+        seconds: What it took: seeds, expansion, continuity of all edges, refinement.
+        quality: Its figures.
+    """
+
+    robot: str
+    task: str
+    method: str
+    refined: bool
+    seconds: float
+    quality: Quality
+
+    @property
+    def paper(self) -> tuple[float, float, float] | None:
+        """The paper's connectivity [%], smoothness [rad/m] and build time [min]; it has none for refined maps."""
+        return None if self.refined else PAPER[self.robot, self.task].get(self.method)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        names = ("robot", "task", "method", "refined", "seconds")
+        return {**{name: getattr(self, name) for name in names}, "paper": self.paper, **self.quality.to_dict()}
+
+
+def measure_roadmaps(
+    *,
+    robots: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
+    reachability: int = 40,
+    samples: int = 100,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> list[Result]:
+    """Builds the four problems by every method, plain and refined.
+
+    Args:
+        robots: Of planar_5 and kinova; both by default.
+        methods: Of `METHODS`; all by default.
+        reachability: Random starts a vertex that tell which are reachable.
+        samples: Random configurations a vertex, for the method "random".
+        seed: Of all random draws.
+        progress: Told which roadmap is built.
+
+    Raises:
+        UnknownNameError: No such robot or method.
+    """
+    for names, known, kind in ((robots, ("planar_5", "kinova"), "robot"), (methods, METHODS, "method")):
+        for name in names or ():
+            if name not in known:
+                raise UnknownNameError(kind, name, known)
+    problems = [problem for problem in PROBLEMS if robots is None or problem[0] in robots]
+    jobs = [(robot, task, method) for robot, task in problems for method in (methods or METHODS)]
+    results: list[Result] = []
+    for index, (name, task, method) in enumerate(jobs):
+        progress(f"{name} {task}, {method}", index, len(jobs))
+        robot = load_robot(name)
+        plain = build(
+            robot,
+            task,
+            seeds="auto" if method == "auto" else None,
+            method="random" if method == "random" else "expansion",
+            samples=samples,
+            refine=False,
+            reachability=reachability,
+            seed=seed,
+        )
+        results.append(Result(name, task, method, False, plain.build_seconds, plain.quality()))
+        refined = refine(plain, seed=seed)
+        results.append(Result(name, task, method, True, refined.build_seconds, refined.quality()))
+    progress("done", len(jobs), len(jobs))
+    return results

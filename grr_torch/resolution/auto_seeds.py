@@ -1,0 +1,210 @@
+"""Seeds without hands: closed paths round the base, the best of several cheap expansions.
+
+A candidate starts from one configuration, a medoid of the self-motion manifold of some point, and is led once round
+the axis of the first joint. Turned rigidly with that joint and projected, a posture that the task allows all round
+closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph, the best of
+them relaxed there; the one with the smallest slopes, where what is missing counts as steep, seeds the roadmap.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from grr_torch.errors import SeedError, check_seed
+from grr_torch.progress import Progress, silent
+from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.resolution.expand import grow
+from grr_torch.resolution.reachability import within_reach
+from grr_torch.resolution.relax import Network, relax
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.configuration import distance, wrap
+from grr_torch.spaces.graph import Copies, TaskGraph, staggered_grid
+from grr_torch.spaces.task import TaskSpace
+
+# points whose self-motion manifolds are sampled, random starts of each, and medoids of each
+_ANCHORS = 10
+_STARTS = 64
+_MEDOIDS = 3
+# seeds on a closed path
+_STATIONS = 12
+# vertices of the coarse graph, in the plane and in space
+_COARSE = {2: 400, 3: 1200}
+# candidates that are relaxed on it
+_RELAXED = 8
+# vertices averaged over on it
+_NEIGHBOURS = 24
+# an edge counts at most this many times the median of slopes
+_STEEP = 6.0
+
+
+def find_seeds(
+    robot: Robot,
+    task: TaskSpace,
+    graph: TaskGraph,
+    *,
+    seed: int = 0,
+    tolerances: Tolerances,
+    progress: Progress = silent,
+) -> Tensor:
+    """Finds seeds (S, n) for a task graph.
+
+    Args:
+        robot: The robot.
+        task: The task space.
+        graph: The task graph that will be expanded; a coarser one over its bounds is tried out.
+        seed: Of all random draws.
+        tolerances: Of the projections.
+        progress: Told what is being done and how far it is.
+
+    Raises:
+        SeedError: No point of the graph is reached from random starts.
+    """
+    generator = torch.Generator().manual_seed(check_seed(seed))
+    candidates = _closed_paths(robot, task, *_medoids(robot, task, graph, generator, tolerances), tolerances)
+    bounds = torch.stack([graph.points.amin(0), graph.points.amax(0)], dim=1).tolist()
+    coarse = staggered_grid([(low, high) for low, high in bounds], min(_COARSE[task.dimension], len(graph.points)))
+    progress("choosing seeds", 0, 2)
+    maps = _expansions(robot, task, coarse, candidates, tolerances)
+    costs = torch.tensor([_cost(robot, task, coarse, configurations) for configurations in maps])
+    progress("choosing seeds", 1, 2)
+    best = costs.argsort(stable=True)[:_RELAXED].tolist()
+    final = [_cost(robot, task, coarse, _relaxed(robot, task, coarse, maps[index], tolerances)) for index in best]
+    progress("choosing seeds", 2, 2)
+    return candidates[best[final.index(min(final))]]
+
+
+def _expansions(
+    robot: Robot, task: TaskSpace, graph: TaskGraph, candidates: list[Tensor], tolerances: Tolerances
+) -> Tensor:
+    """(C, V, n) expansions of all candidates at once; NaN where unresolved."""
+    size = len(graph.points)
+    seeds = torch.cat(candidates)
+    owner = torch.arange(len(candidates)).repeat_interleave(torch.tensor([len(path) for path in candidates]))
+    nearest = graph.nearest(robot.forward_kinematics(seeds)[0][:, : task.dimension])[:, 0]
+    targets = graph.points[nearest].to(seeds)
+    solved, valid = project_columns(robot, task, targets.T.contiguous(), seeds.T.contiguous(), tolerances)
+    valid = valid.cpu()
+    vertices, inverse = (owner * size + nearest)[valid].unique(return_inverse=True)
+    # of seeds that share a vertex, one
+    kept = torch.empty(len(vertices), dtype=torch.long).scatter_(0, inverse, torch.arange(len(inverse)))
+    expansion = grow(
+        robot,
+        task,
+        Copies.of(graph, len(candidates)),
+        vertices.to(seeds.device),
+        solved.T[valid.to(seeds.device)][kept.to(seeds.device)],
+        neighbours=_NEIGHBOURS,
+        tolerances=tolerances,
+    )
+    return expansion.configurations.reshape(len(candidates), size, robot.n)
+
+
+def _medoids(
+    robot: Robot, task: TaskSpace, graph: TaskGraph, generator: torch.Generator, tolerances: Tolerances
+) -> tuple[Tensor, Tensor]:
+    """Points (K, width) and at each a configuration (K, n) far from the others found there.
+
+    Raises:
+        SeedError: No point was reached.
+    """
+    inside = within_reach(robot, task, graph.points).nonzero()[:, 0]
+    chosen = inside[torch.randperm(len(inside), generator=generator)[: 4 * _ANCHORS]]
+    guesses = robot.sample(len(chosen) * _STARTS, generator)
+    targets = graph.points[chosen].repeat_interleave(_STARTS, dim=0).to(guesses)
+    solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
+    configurations = solved.T.reshape(len(chosen), _STARTS, robot.n)
+    valid = valid.reshape(len(chosen), _STARTS)
+    # where most starts succeed the arm has room
+    best = valid.sum(1).argsort(descending=True, stable=True)[:_ANCHORS].tolist()
+    points: list[Tensor] = []
+    medoids: list[Tensor] = []
+    for anchor in best:
+        found = configurations[anchor][valid[anchor]]
+        if len(found) == 0:
+            continue
+        apart = distance(found[:, None], found[None], robot.continuous)
+        picked = [int(apart.sum(1).argmin())]
+        while len(picked) < min(_MEDOIDS, len(found)):
+            picked.append(int(apart[:, picked].amin(1).argmax()))
+        medoids.append(found[picked])
+        points.append(graph.points[chosen[anchor]].to(found).expand(len(picked), -1))
+    if not medoids:
+        raise SeedError(f"no seeds were found: none of {len(chosen)} points was reached from {_STARTS} random starts")
+    return torch.cat(points), torch.cat(medoids)
+
+
+def _closed_paths(
+    robot: Robot, task: TaskSpace, points: Tensor, configurations: Tensor, tolerances: Tolerances
+) -> list[Tensor]:
+    """For each configuration (K, n), the valid ones (S, n) on a closed path round the first joint's axis.
+
+    The next station is guessed in two ways: turned rigidly with the first joint, or as it is.
+    """
+    tree = robot.tree
+    first = tree.path[0]
+    joint, mount = tree.joints[first], tree.mounts[first]
+    if not joint.revolute:
+        return [q[None] for q in configurations]
+    axis, origin = mount[2, :3], mount[3, :3]
+    paths: list[Tensor] = []
+    angles = [2.0 * math.pi * k / _STATIONS for k in range(_STATIONS)]
+    stations = torch.stack([_turned(points, axis, origin, angle) for angle in angles])
+    for rigid in (1.0, 0.0):
+        q = configurations
+        found: list[Tensor] = []
+        reached: list[Tensor] = []
+        for k in range(_STATIONS):
+            guess = q.clone()
+            if k:
+                guess[:, joint.dof] = wrap(guess[:, joint.dof] + rigid * 2.0 * math.pi / _STATIONS)
+            guess = guess.clamp(robot.lower, robot.upper)
+            solved, valid = project_columns(robot, task, stations[k].T.contiguous(), guess.T.contiguous(), tolerances)
+            q = torch.where(valid[:, None], solved.T, guess)
+            found.append(q)
+            reached.append(valid)
+        rings, there = torch.stack(found, dim=1), torch.stack(reached, dim=1)
+        paths.extend(ring[mask] for ring, mask in zip(rings, there, strict=True) if int(mask.sum()) > _STATIONS // 2)
+    return paths or [q[None] for q in configurations]
+
+
+def _turned(points: Tensor, axis: Tensor, origin: Tensor, angle: float) -> Tensor:
+    """Points (K, d) turned about an axis in space; in the plane, about where it crosses."""
+    d = points.shape[1]
+    arms = torch.zeros(len(points), 3, dtype=points.dtype, device=points.device)
+    arms[:, :d] = points - origin[:d]
+    along = (arms @ axis)[:, None] * axis
+    across = arms - along
+    turned = along + math.cos(angle) * across + math.sin(angle) * torch.linalg.cross(axis.expand_as(across), across)
+    return origin[:d] + turned[:, :d]
+
+
+def _cost(robot: Robot, task: TaskSpace, graph: TaskGraph, configurations: Tensor) -> float:
+    """Sum of slopes over all edges of a graph, where a missing or steep one counts as six of the median."""
+    first, second = graph.edges.to(configurations.device).unbind(1)
+    points = graph.points.to(configurations)
+    slopes = distance(configurations[first], configurations[second], robot.continuous)
+    slopes = slopes / task.distance(points[first], points[second])
+    known = slopes[slopes.isfinite()]
+    limit = _STEEP * float(known.median()) if len(known) else torch.inf
+    return float(slopes.nan_to_num(limit).clamp(max=limit).sum())
+
+
+def _relaxed(robot: Robot, task: TaskSpace, graph: TaskGraph, q: Tensor, tolerances: Tolerances) -> Tensor:
+    """Configurations (V, n), relaxed over all edges between resolved vertices that are not steep."""
+    first, second = graph.edges.to(q.device).unbind(1)
+    points = graph.points.to(q)
+    lengths = task.distance(points[first], points[second])
+    slopes = distance(q[first], q[second], robot.continuous) / lengths
+    if not bool(slopes.isfinite().any()):
+        return q
+    kept = slopes <= _STEEP * float(slopes[slopes.isfinite()].median())
+    vertices = (~q.isnan().any(1)).nonzero()[:, 0]
+    rank = torch.full((len(q),), -1, device=q.device)
+    rank[vertices] = torch.arange(len(vertices), device=q.device)
+    edges = torch.stack([rank[first[kept]], rank[second[kept]]])
+    network = Network(robot, task, points[vertices].T.contiguous(), edges, lengths[kept])
+    moved = relax(network, q[vertices].T.contiguous(), tolerances, silent)
+    return q.index_put((vertices,), moved.T)
