@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from grr_torch.cli.show import print_json, print_rows, progress_bar, quality_rows, reports_errors
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from grr_torch.resolution.roadmap import Roadmap
+
+
+# steep edges that are listed
+_LISTED = 20
 
 
 @reports_errors
@@ -15,15 +24,26 @@ def info(
     verify: Annotated[
         bool, typer.Option("--verify", help="Recompute everything and hold it against what is stored.")
     ] = False,
+    max_slope: Annotated[
+        float | None,
+        typer.Option(
+            help="List connected edges whose D_q / D_p is above this, in rad/m; by default ten times the median."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Show what a roadmap file holds; exit code 2 if it is not consistent with itself.
 
     Example: grr-torch info kinova.grr --verify
     """
+    from grr_torch.errors import ParameterError
+    from grr_torch.resolution.quality import Quality, steep_edges
+    from grr_torch.resolution.refine import summary
     from grr_torch.resolution.roadmap_file import load_roadmap, read_file
     from grr_torch.resolution.verify import verify_file
 
+    if max_slope is not None and not max_slope > 0.0:
+        raise ParameterError("--max-slope", max_slope, "above 0, in rad/m")
     metadata = read_file(file)[0]
     roadmap = load_roadmap(file)
     quality: dict[str, Any] = metadata["quality"]
@@ -31,6 +51,7 @@ def info(
     if verify:
         with progress_bar() as progress:
             checks = verify_file(file, progress=progress)
+    steep = steep_edges(roadmap, max_slope)
     passed = all(check.passed for check in checks)
     robot = roadmap.robot
     if as_json:
@@ -46,6 +67,7 @@ def info(
             "format_version": metadata["format_version"],
             "package_version": metadata.get("package_version"),
         }
+        data["steep"] = [roadmap.edges[edge].tolist() for edge in steep.tolist()]
         if verify:
             data["verified"] = passed
             data["checks"] = {check.name: {"passed": check.passed, "detail": check.detail} for check in checks}
@@ -66,7 +88,10 @@ def info(
             *quality_rows(quality),
             ("built in", f"{roadmap.build_seconds:.2f} s by grr-torch {metadata.get('package_version')}"),
         ]
-        print_rows(f"{file}: {robot.name}, {roadmap.task.kind}", rows)
+        change = summary(roadmap, Quality(**quality))
+        print_rows(f"{file}: {robot.name}, {roadmap.task.kind}", [*rows, *([("refined", change)] if change else [])])
+        if len(steep):
+            print_rows(f"{len(steep)} steep edges, the steepest first", _steep_rows(roadmap, steep[:_LISTED]))
         if checks:
             results = [(f"{'✓' if check.passed else '✗'} {check.name}", check.detail) for check in checks]
             print_rows("verified" if passed else "NOT verified", results)
@@ -74,3 +99,18 @@ def info(
         failed = ", ".join(check.name for check in checks if not check.passed)
         typer.secho(f"error: {file} is not consistent with itself: {failed}", err=True, fg=typer.colors.RED)
         raise typer.Exit(2)
+
+
+def _steep_rows(roadmap: Roadmap, edges: Tensor) -> list[tuple[str, str]]:
+    from grr_torch.resolution.quality import edge_slopes
+
+    slopes = dict(zip(roadmap.connected.nonzero()[:, 0].tolist(), edge_slopes(roadmap).tolist(), strict=True))
+
+    def place(vertex: int) -> str:
+        return "(" + ", ".join(f"{value:.3f}" for value in roadmap.points[vertex].tolist()) + ")"
+
+    return [
+        (f"{a} – {b}", f"{slopes[edge]:.1f} rad/m between {place(a)} and {place(b)} m")
+        for edge in edges.tolist()
+        for a, b in [roadmap.edges[edge].tolist()]
+    ]

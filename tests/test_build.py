@@ -18,20 +18,23 @@ from grr_torch.spaces.graph import TaskGraph
 
 # reachable vertices and edges between them, as the arm's own shapes allow
 PROBLEMS = [
-    ("planar_5", "position", 761, 2168, 1.0, 1.0, 5.675),
-    ("planar_5", "fixed-rotation", 488, 1379, 1.0, 1.0, 9.7),
-    ("kinova", "position", 1267, 6105, 0.995, 0.995, 2.6),
-    ("kinova", "fixed-rotation", 430, 1896, 0.98, 0.965, 4.75),
+    ("planar_5", "position", 761, 2168, 1.0, 1.0, 5.25, 0.995),
+    ("planar_5", "fixed-rotation", 488, 1379, 1.0, 1.0, 8.9, 0.985),
+    ("kinova", "position", 1267, 6105, 0.999, 0.998, 2.51, 0.985),
+    ("kinova", "fixed-rotation", 430, 1896, 0.985, 0.98, 4.17, 0.988),
 ]
 
 
-@pytest.mark.parametrize(("name", "kind", "reachable", "edges", "coverage", "connectivity", "smoothness"), PROBLEMS)
-def test_the_paper_s_problems(name, kind, reachable, edges, coverage, connectivity, smoothness):
+@pytest.mark.parametrize(
+    ("name", "kind", "reachable", "edges", "coverage", "connectivity", "smoothness", "certified"), PROBLEMS
+)
+def test_the_paper_s_problems(name, kind, reachable, edges, coverage, connectivity, smoothness, certified):
     roadmap = grr_torch.build(grr_torch.load_robot(name), kind)
     quality = roadmap.quality()
     assert quality.resolved_vertices >= coverage * reachable
     assert quality.connected_edges >= connectivity * edges
     assert quality.smoothness <= smoothness
+    assert quality.triangles_certified >= certified
     assert quality.max_position_error <= 1e-4
     assert quality.max_rotation_error <= 1e-3
     assert quality.joint_limit_violations == 0
@@ -157,7 +160,6 @@ def test_unusable_seeds_are_named_and_the_build_goes_on(kinova, generator):
         ([], "seeds have shape|no seeds"),
         ([[math.nan] * 5, [0.0] * 5], "seeds 0 hold NaN"),
         ([[0.0] * 5, [0.0] * 4], "not a table"),
-        ("abc", "not a table"),
     ],
 )
 def test_bad_seeds_are_errors(planar_5, seeds, complaint):
@@ -214,5 +216,10 @@ def test_an_unknown_task_lists_the_known(kinova):
 def test_a_robot_without_preset_must_be_told_everything(box_arm):
     with pytest.raises(ParameterError, match="points and bounds: got nothing"):
         grr_torch.build(grr_torch.load_robot(box_arm), "position")
-    with pytest.raises(SeedError, match="no preset"):
-        grr_torch.build(grr_torch.load_robot(box_arm), "position", points=50, bounds=[(-0.5, 0.5)] * 3)
+
+
+def test_unknown_seeds_and_methods_are_errors(planar_5):
+    with pytest.raises(UnknownNameError, match="auto"):
+        grr_torch.build(planar_5, "position", seeds="abc")
+    with pytest.raises(UnknownNameError, match="expansion, random"):
+        grr_torch.build(planar_5, "position", method="abc")

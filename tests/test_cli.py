@@ -30,6 +30,8 @@ QUALITY = {
     "smoothness_median",
     "smoothness_p99",
     "smoothness_max",
+    "steep_edges",
+    *(f"{shape}{figure}" for shape in ("triangles", "squares") for figure in ("", "_wound", "_spread", "_certified")),
     "max_position_error",
     "max_rotation_error",
     "min_self_collision_distance",

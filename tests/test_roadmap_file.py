@@ -69,7 +69,7 @@ def test_it_loads_without_the_urdf(box_arm, tmp_path):
 def test_the_file_names_its_tensors_and_origin(saved):
     assert set(load_file(saved)) == set(TENSORS)
     metadata = {name: json.loads(value) for name, value in header(saved).items()}
-    assert metadata["format_version"] == 1
+    assert metadata["format_version"] == 2
     assert metadata["package_version"] == grr_torch.__version__
     assert metadata["robot"]["tool"] == "tool"
     assert len(metadata["robot"]["urdf_sha256"]) == 64
@@ -149,7 +149,7 @@ DAMAGES = {
     "truncated": "truncated",
     "text": "truncated or not a roadmap",
     "empty": "truncated or not a roadmap",
-    "version": "format version 99; this version reads 1",
+    "version": "format version 99; this version reads 2",
     "foreign": "not a roadmap of grr-torch",
     "metadata": "cannot be read",
     "robot": "metadata without .urdf_directory.",

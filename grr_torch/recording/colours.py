@@ -10,6 +10,8 @@ Colours = npt.NDArray[np.uint8]
 
 CONNECTED = (58, 66, 78, 255)
 BROKEN = (235, 70, 50, 255)
+WOUND = (225, 60, 190, 150)
+SPREAD = (240, 150, 40, 110)
 UNRESOLVED = (255, 176, 0, 255)
 GRID = (40, 43, 50, 255)
 TOUR = (235, 235, 235, 255)

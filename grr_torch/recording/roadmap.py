@@ -27,7 +27,9 @@ def record_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
 
     On the timeline `wave` the expansion grows; on `tour` the arm moves along connected edges. Entities:
     `roadmap/by_joint/…` and `roadmap/clearance` colour the resolved vertices, `roadmap/connected`, `roadmap/broken`
-    and `roadmap/grid` are edges, `roadmap/unresolved` are vertices that are reachable but have no configuration.
+    and `roadmap/grid` are edges, `roadmap/cells/wound` and `roadmap/cells/spread` are triangles that are not certified
+    because of a winding or a spread above 1 rad, `roadmap/unresolved` are vertices that are reachable but have no
+    configuration.
 
     Raises:
         OutputError: It cannot be written.
@@ -99,6 +101,14 @@ def _log_map(recording: Any, roadmap: Roadmap) -> None:
     log("connected", rr.LineStrips3D(points[edges[connected]], colors=colours.CONNECTED, radii=_line(0.4)))
     log("broken", rr.LineStrips3D(points[edges[broken]], colors=colours.BROKEN, radii=_line(1.6)))
     log("grid", rr.LineStrips3D(points[edges], colors=colours.GRID, radii=_line(0.25)))
+    triangles = roadmap.cells()[0]
+    for name, cells, colour in (
+        ("wound", triangles.wound, colours.WOUND),
+        ("spread", triangles.spread_out, colours.SPREAD),
+    ):
+        corners = triangles.corners[cells].numpy()
+        if len(corners):
+            log(f"cells/{name}", rr.Mesh3D(vertex_positions=points, triangle_indices=corners, albedo_factor=colour))
     if roadmap.reachable is not None:
         left = (roadmap.reachable & ~roadmap.resolved).numpy()
         log("unresolved", rr.Points3D(points[left], colors=colours.UNRESOLVED, radii=1.6 * radius))

@@ -28,10 +28,10 @@ _ROUNDS = 12
 # pairs of configurations whose continuity is checked together
 _PAIRS_AT_ONCE = 1 << 16
 # moves of the solver: of a descent, for every vertex; and descents
-_MOVES = 60
+_MOVES = 1500
 _DESCENTS = 4
 # share of moves to a random value, which leads out of dead ends
-_RANDOM_MOVES = 0.02
+_RANDOM_MOVES = 0.1
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def random_grr(
     graph: TaskGraph,
     *,
     samples: int = 100,
-    nearest: int = 3,
+    nearest: int = 6,
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
     progress: Progress = silent,

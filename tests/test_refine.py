@@ -1,0 +1,129 @@
+"""Refinement keeps what there was and makes it smoother; seeds that are found; the random baseline."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import grr_torch
+from grr_torch.errors import ParameterError, SeedError
+from grr_torch.projection.columns import null_space_projector
+from grr_torch.projection.project import Tolerances
+from grr_torch.resolution.auto_seeds import find_seeds
+from grr_torch.resolution.build import check_edges
+from grr_torch.resolution.random_grr import random_grr
+from grr_torch.resolution.refine import refine, summary
+from grr_torch.spaces.graph import Copies, staggered_grid
+
+PROBLEMS = [("planar_5", "position", 400), ("planar_5", "fixed-rotation", 400), ("kinova", "fixed-rotation", 1500)]
+
+
+@pytest.mark.parametrize(("name", "task", "points"), PROBLEMS)
+def test_nothing_is_lost_and_the_map_is_smoother(name, task, points):
+    plain = grr_torch.build(grr_torch.load_robot(name), task, points=points, refine=False)
+    refined = refine(plain)
+    assert bool((refined.resolved | ~plain.resolved).all())
+    assert bool((refined.connected | ~plain.connected).all())
+    before, after = plain.quality(), refined.quality()
+    assert after.smoothness < before.smoothness
+    assert after.joint_limit_violations == 0
+    assert after.self_collisions in (None, 0)
+    assert after.max_position_error <= 1e-4 * (1.0 + 1e-6)
+    assert torch.equal(check_edges(refined, Tolerances()), refined.connected)
+    assert f"{before.smoothness:.3f} → {after.smoothness:.3f}" in summary(refined, after)
+    assert summary(plain, before) == ""
+
+
+def test_refining_again_changes_little(planar_5):
+    once = grr_torch.build(planar_5, "position", points=400)
+    twice = refine(once)
+    assert twice.quality().smoothness == pytest.approx(once.quality().smoothness, rel=0.01)
+
+
+def test_the_same_map_is_refined_to_the_same_bytes(kinova):
+    plain = grr_torch.build(kinova, "position", points=500, refine=False)
+    first, second = refine(plain, seed=3), refine(plain, seed=3)
+    for name in ("configurations", "resolved", "connected"):
+        assert getattr(first, name).numpy().tobytes() == getattr(second, name).numpy().tobytes()
+
+
+def test_what_was_taken_away_is_repaired(planar_5):
+    whole = grr_torch.build(planar_5, "position", points=400, refine=False)
+    inner = (whole.points.norm(dim=1) < 0.35).nonzero()[:, 0]
+    taken = inner[::25]
+    configurations, resolved = whole.configurations.clone(), whole.resolved.clone()
+    configurations[taken], resolved[taken] = math.nan, False
+    connected = whole.connected & ~torch.isin(whole.edges, taken).any(1)
+    damaged = replace(whole, configurations=configurations, resolved=resolved, connected=connected)
+    mended = refine(damaged)
+    assert bool(mended.resolved[taken].all())
+    assert int(mended.connected.sum()) >= int(whole.connected.sum())
+
+
+def test_the_null_space_projector_keeps_what_leaves_the_task_alone(generator):
+    jacobian = torch.randn(3, 7, 20, dtype=torch.float64, generator=generator)
+    projector = null_space_projector(jacobian, 1e-12)
+    for k in range(20):
+        p, j = projector[:, :, k], jacobian[:, :, k]
+        torch.testing.assert_close(p @ p, p, atol=1e-9, rtol=0)
+        torch.testing.assert_close(p, p.T, atol=1e-9, rtol=0)
+        assert float((j @ p).abs().max()) < 1e-9
+        assert float(p.trace()) == pytest.approx(4.0, abs=1e-8)
+
+
+@pytest.mark.parametrize(("name", "task"), [("planar_5", "position"), ("kinova", "fixed-rotation")])
+def test_seeds_are_found_that_do_nearly_as_well_as_the_paper_s(name, task):
+    robot = grr_torch.load_robot(name)
+    by_hand = grr_torch.build(robot, task).quality()
+    found = grr_torch.build(robot, task, seeds="auto").quality()
+    assert found.resolved_vertices >= 0.99 * by_hand.resolved_vertices
+    assert found.connected_edges >= 0.97 * by_hand.connected_edges
+    assert found.smoothness <= 1.1 * by_hand.smoothness
+
+
+def test_an_arm_without_preset_needs_no_seeds(box_arm):
+    roadmap = grr_torch.build(
+        grr_torch.load_robot(box_arm), "position", points=200, bounds=[(-0.6, 0.6)] * 2 + [(0.2, 1.0)]
+    )
+    assert int(roadmap.resolved.sum()) > 10
+    assert len(roadmap.parameters["seeds"]) > 0
+
+
+def test_where_nothing_is_reached_no_seeds_are_found(kinova):
+    # inside the pedestal of the arm itself
+    graph = staggered_grid([(-0.01, 0.01), (-0.01, 0.01), (0.0, 0.02)], 9)
+    with pytest.raises(SeedError, match="no seeds were found"):
+        find_seeds(kinova, grr_torch.FixedRotation(3), graph, tolerances=Tolerances())
+
+
+def test_copies_have_nothing_between_them():
+    graph = staggered_grid([(0.0, 1.0)] * 2, 30)
+    copies = Copies.of(graph, 3)
+    size = len(graph.points)
+    assert torch.equal(copies.edges // size, (copies.edges // size)[:, :1].expand(-1, 2))
+    indices, distances = copies.neighbours(torch.tensor([size + 4]), 8)
+    expected, lengths = graph.neighbours(torch.tensor([4]), 8)
+    assert torch.equal(distances, lengths)
+    assert torch.equal((indices - size)[lengths.isfinite()], expected[lengths.isfinite()])
+
+
+def test_random_grr_resolves_the_disc_with_continuous_edges(planar_5):
+    roadmap = grr_torch.build(
+        planar_5, "position", points=150, method="random", samples=40, refine=False, reachability=4
+    )
+    quality = roadmap.quality()
+    assert quality.coverage == 1.0
+    assert quality.connectivity > 0.9
+    assert torch.equal(check_edges(roadmap, Tolerances())[roadmap.connected], roadmap.connected[roadmap.connected])
+    # what is picked at random is steeper than what is expanded
+    assert quality.smoothness > grr_torch.build(planar_5, "position", points=150).quality().smoothness
+
+
+@pytest.mark.parametrize("options", [{"samples": 0}, {"nearest": 0}, {"samples": 5, "nearest": 6}])
+def test_random_grr_refuses_empty_pools(planar_5, options):
+    graph = staggered_grid([(-0.4, 0.4)] * 2, 20)
+    with pytest.raises(ParameterError):
+        random_grr(planar_5, grr_torch.Position(2), graph, **options)
