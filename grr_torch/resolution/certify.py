@@ -1,7 +1,7 @@
 """Certification: cells whose corners lead to configurations a little too far apart are drawn together.
 
 A cell far beyond the limit stays as it is: where the map has to be discontinuous somewhere, to draw together would only
-move the place.
+move the place. Where several neighbours share a twist that none can lose, the worst of them is given up for the others.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from grr_torch.resolution.cells import LARGEST_SPREAD, lead_to_centres
 from grr_torch.resolution.relax import Network, Pulls, gauss_newton_step, move
 from grr_torch.spaces.configuration import difference
 
-_ROUNDS = 12
+_ROUNDS = 18
 # cells with less spread are not looked at [rad]
 _SUSPECT = 0.6
 # spread that is aimed at [rad], and beyond which a cell is given up [rad]
@@ -25,6 +25,8 @@ _HOPELESS = 1.4
 # how much a pull counts against an edge of typical weight
 _WEIGHT = 3.0
 _DAMPING = 0.3
+# rounds in which, of what is left, the worst are given up
+_SACRIFICES = (6, 10, 14)
 
 
 def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress) -> Tensor:
@@ -43,6 +45,7 @@ def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances
             return q
         weight = _WEIGHT * float((1.0 / network.lengths).mean())
         best, fewest = q, torch.inf
+        given_up = torch.zeros(len(corners), dtype=torch.bool, device=q.device)
         for done in range(_ROUNDS):
             progress("certifying", done, _ROUNDS)
             spread, pairs, apart = _spread(network, corners, q, tolerances)
@@ -50,7 +53,9 @@ def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances
             if uncertified < fewest:
                 best, fewest = q, uncertified
             excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
-            pulled = ((excess > 0.0) & (spread <= _HOPELESS).repeat(3)).nonzero()[:, 0]
+            if done in _SACRIFICES:
+                given_up |= _worst_of_neighbours(network, corners, spread)
+            pulled = ((excess > 0.0) & ((spread <= _HOPELESS) & ~given_up).repeat(3)).nonzero()[:, 0]
             if len(pulled) == 0:
                 break
             # only what is beyond the aim is drawn in
@@ -62,6 +67,15 @@ def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances
             best = q
     progress("certifying", _ROUNDS, _ROUNDS)
     return best
+
+
+def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> Tensor:
+    """(C,) cells above the limit that share a corner with none that is worse, of those that are not hopeless."""
+    worst = spread.new_zeros(network.targets.shape[1])
+    open_cells = (spread > LARGEST_SPREAD) & (spread <= _HOPELESS)
+    counted = torch.where(open_cells, spread, 0.0)
+    worst = worst.scatter_reduce(0, corners.flatten(), counted.repeat_interleave(3), "amax")
+    return open_cells & (spread >= worst[corners].amax(1))
 
 
 def _spread(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances) -> tuple[Tensor, Tensor, Tensor]:
