@@ -33,7 +33,9 @@ _STATIONS = 12
 # vertices of the coarse graph, in the plane and in space
 _COARSE = {2: 400, 3: 1200}
 # candidates that are relaxed on it
-_RELAXED = 8
+_RELAXED = 12
+# in so many rounds
+_ROUNDS = 10
 # vertices averaged over on it
 _NEIGHBOURS = 24
 # an edge counts at most this many times the median of slopes
@@ -71,7 +73,8 @@ def find_seeds(
     costs = torch.tensor([_cost(robot, task, coarse, configurations) for configurations in maps])
     progress("choosing seeds", 1, 2)
     best = costs.argsort(stable=True)[:_RELAXED].tolist()
-    final = [_cost(robot, task, coarse, _relaxed(robot, task, coarse, maps[index], tolerances)) for index in best]
+    relaxed = _relaxed(robot, task, coarse, maps[best], tolerances)
+    final = [_cost(robot, task, coarse, configurations) for configurations in relaxed]
     progress("choosing seeds", 2, 2)
     return candidates[best[final.index(min(final))]]
 
@@ -192,19 +195,21 @@ def _cost(robot: Robot, task: TaskSpace, graph: TaskGraph, configurations: Tenso
     return float(slopes.nan_to_num(limit).clamp(max=limit).sum())
 
 
-def _relaxed(robot: Robot, task: TaskSpace, graph: TaskGraph, q: Tensor, tolerances: Tolerances) -> Tensor:
-    """Configurations (V, n), relaxed over all edges between resolved vertices that are not steep."""
-    first, second = graph.edges.to(q.device).unbind(1)
-    points = graph.points.to(q)
+def _relaxed(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tolerances: Tolerances) -> Tensor:
+    """Maps (C, V, n), relaxed together over all edges between resolved vertices that are not steep."""
+    copies = Copies.of(graph, len(maps))
+    q = maps.reshape(-1, robot.n)
+    first, second = copies.edges.to(q.device).unbind(1)
+    points = copies.points.to(q)
     lengths = task.distance(points[first], points[second])
     slopes = distance(q[first], q[second], robot.continuous) / lengths
     if not bool(slopes.isfinite().any()):
-        return q
+        return maps
     kept = slopes <= _STEEP * float(slopes[slopes.isfinite()].median())
     vertices = (~q.isnan().any(1)).nonzero()[:, 0]
     rank = torch.full((len(q),), -1, device=q.device)
     rank[vertices] = torch.arange(len(vertices), device=q.device)
     edges = torch.stack([rank[first[kept]], rank[second[kept]]])
     network = Network(robot, task, points[vertices].T.contiguous(), edges, lengths[kept])
-    moved = relax(network, q[vertices].T.contiguous(), tolerances, silent)
-    return q.index_put((vertices,), moved.T)
+    moved = relax(network, q[vertices].T.contiguous(), tolerances, silent, rounds=_ROUNDS)
+    return q.index_put((vertices,), moved.T).reshape(maps.shape)

@@ -77,12 +77,12 @@ class Pulls(NamedTuple):
     weights: Tensor
 
 
-def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progress) -> Tensor:
+def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progress, rounds: int = _ROUNDS) -> Tensor:
     """Configurations (n, V) of lower cost: converged, within limits and free of self-collision like those given."""
     damping, cost = 1e-2, network.cost(q)
     with one_thread(), torch.no_grad():
-        for done in range(_ROUNDS):
-            progress("refining", done, _ROUNDS)
+        for done in range(rounds):
+            progress("refining", done, rounds)
             moved = move(network, q, gauss_newton_step(network, q, damping), tolerances)
             new_cost = network.cost(moved)
             if new_cost < cost:
@@ -94,7 +94,7 @@ def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progres
                 damping *= 10.0
                 if damping > 1e3:
                     break
-    progress("refining", _ROUNDS, _ROUNDS)
+    progress("refining", rounds, rounds)
     return q
 
 
