@@ -38,8 +38,10 @@ _RELAXED = 12
 _ROUNDS = 10
 # vertices averaged over on it
 _NEIGHBOURS = 24
-# an edge counts at most this many times the median of slopes
+# edges steeper than this many times the median are not relaxed
 _STEEP = 6.0
+# an edge that is missing, or steeper, counts as this many times the smallest median of slopes
+_MISSING = 15.0
 
 
 def find_seeds(
@@ -70,13 +72,11 @@ def find_seeds(
     coarse = staggered_grid([(low, high) for low, high in bounds], min(_COARSE[task.dimension], len(graph.points)))
     progress("choosing seeds", 0, 2)
     maps = _expansions(robot, task, coarse, candidates, tolerances)
-    costs = torch.tensor([_cost(robot, task, coarse, configurations) for configurations in maps])
     progress("choosing seeds", 1, 2)
-    best = costs.argsort(stable=True)[:_RELAXED].tolist()
+    best = _costs(robot, task, coarse, maps).argsort(stable=True)[:_RELAXED].tolist()
     relaxed = _relaxed(robot, task, coarse, maps[best], tolerances)
-    final = [_cost(robot, task, coarse, configurations) for configurations in relaxed]
     progress("choosing seeds", 2, 2)
-    return candidates[best[final.index(min(final))]]
+    return candidates[best[int(_costs(robot, task, coarse, relaxed).argmin())]]
 
 
 def _expansions(
@@ -184,15 +184,13 @@ def _turned(points: Tensor, axis: Tensor, origin: Tensor, angle: float) -> Tenso
     return origin[:d] + turned[:, :d]
 
 
-def _cost(robot: Robot, task: TaskSpace, graph: TaskGraph, configurations: Tensor) -> float:
-    """Sum of slopes over all edges of a graph, where a missing or steep one counts as six of the median."""
-    first, second = graph.edges.to(configurations.device).unbind(1)
-    points = graph.points.to(configurations)
-    slopes = distance(configurations[first], configurations[second], robot.continuous)
-    slopes = slopes / task.distance(points[first], points[second])
-    known = slopes[slopes.isfinite()]
-    limit = _STEEP * float(known.median()) if len(known) else torch.inf
-    return float(slopes.nan_to_num(limit).clamp(max=limit).sum())
+def _costs(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Tensor:
+    """(C,) sums of slopes over all edges of a graph, of maps (C, V, n); what is missing counts as steep."""
+    first, second = graph.edges.to(maps.device).unbind(1)
+    points = graph.points.to(maps)
+    slopes = distance(maps[:, first], maps[:, second], robot.continuous) / task.distance(points[first], points[second])
+    limit = _MISSING * slopes.nanmedian(dim=1).values.nan_to_num(torch.inf).amin()
+    return torch.where(slopes.isnan(), limit, slopes.clamp(max=limit)).sum(1)
 
 
 def _relaxed(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tolerances: Tolerances) -> Tensor:
