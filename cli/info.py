@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -88,7 +89,7 @@ def info(
             *quality_rows(quality),
             ("built in", f"{roadmap.build_seconds:.2f} s by grr-torch {metadata.get('package_version')}"),
         ]
-        change = summary(roadmap, Quality(**quality))
+        change = summary(roadmap, Quality(**{field.name: quality[field.name] for field in fields(Quality)}))
         print_rows(f"{file}: {robot.name}, {roadmap.task.kind}", [*rows, *([("refined", change)] if change else [])])
         if len(steep):
             print_rows(f"{len(steep)} steep edges, the steepest first", _steep_rows(roadmap, steep[:_LISTED]))

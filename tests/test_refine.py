@@ -122,8 +122,34 @@ def test_random_grr_resolves_the_disc_with_continuous_edges(planar_5):
     assert quality.smoothness > grr_torch.build(planar_5, "position", points=150).quality().smoothness
 
 
-@pytest.mark.parametrize("options", [{"samples": 0}, {"nearest": 0}, {"samples": 5, "nearest": 6}])
+@pytest.mark.parametrize("options", [{"samples": 0}, {"nearest": 0}, {"samples": 10**6}])
 def test_random_grr_refuses_empty_pools(planar_5, options):
     graph = staggered_grid([(-0.4, 0.4)] * 2, 20)
     with pytest.raises(ParameterError):
         random_grr(planar_5, grr_torch.Position(2), graph, **options)
+
+
+def test_random_seeds_lose_no_edge_and_a_wrong_flag_is_put_right(planar_5):
+    for seed in (1, 2):
+        seeds = planar_5.sample(4, torch.Generator().manual_seed(seed))
+        plain = grr_torch.build(planar_5, "fixed-rotation", points=150, refine=False, seeds=seeds)
+        refined = refine(plain)
+        assert bool((refined.connected | ~plain.connected).all())
+        wrong = replace(plain, connected=plain.resolved[plain.edges].all(1))
+        assert not torch.equal(wrong.connected, check_edges(wrong, Tolerances()))
+        mended = refine(wrong)
+        assert torch.equal(mended.connected, check_edges(mended, Tolerances()))
+
+
+def test_a_map_in_single_precision_is_refined_too():
+    robot = grr_torch.load_robot("planar_5", dtype=torch.float32)
+    plain = grr_torch.build(robot, "position", points=200, refine=False)
+    refined = refine(plain)
+    assert refined.quality().smoothness < plain.quality().smoothness
+
+
+def test_a_flat_graph_in_space_needs_no_seeds(kinova):
+    sheet = staggered_grid([(0.3, 0.6), (-0.3, 0.3)], 60)
+    points = torch.cat([sheet.points, torch.full((len(sheet.points), 1), 0.4, dtype=torch.float64)], dim=1)
+    graph = grr_torch.TaskGraph(points, sheet.edges)
+    assert int(grr_torch.build(kinova, "position", points=graph, seeds="auto").resolved.sum()) > 50

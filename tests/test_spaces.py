@@ -237,6 +237,12 @@ def test_a_grid_s_arithmetic_finds_what_a_search_finds(dimension, n, stretch, k)
     torch.testing.assert_close(found, torch.where(near, everything, torch.inf))
 
 
+def test_a_thin_grid_finds_neighbours_within_it():
+    graph = staggered_grid([(0.2, 1.0), (-0.5, 0.5), (0.3, 0.3001)], 3000)
+    distances = graph.neighbours(torch.arange(len(graph.points)), 64)[1]
+    assert int(distances.isfinite().sum(1).min()) >= 8
+
+
 def test_an_inner_vertex_of_a_grid_has_all_its_neighbours():
     graph = staggered_grid([(-1.0, 1.0)] * 3, 3000)
     middle = graph.nearest(torch.zeros(1, 3, dtype=torch.float64))[0]
@@ -259,6 +265,8 @@ def test_adjacency_lists_both_directions():
         (torch.zeros(2, 2, dtype=torch.float64), torch.empty(0, 2, dtype=torch.long)),
         (torch.eye(2, dtype=torch.float64), torch.tensor([[0, 2]])),
         (torch.eye(2, dtype=torch.float64), torch.tensor([0, 1])),
+        (torch.eye(2, dtype=torch.float64), torch.tensor([[1, 1]])),
+        (torch.eye(2, dtype=torch.float64), torch.tensor([[1, 0]])),
     ],
 )
 def test_a_bad_graph_is_an_error(points, edges):

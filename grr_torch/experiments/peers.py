@@ -8,7 +8,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,10 @@ def installed_peers(names: tuple[str, ...] | None = None) -> tuple[dict[str, str
         if importlib.util.find_spec(module) is None:
             missing[name] = "not installed: pip install 'grr-torch[bench]'"
         else:
-            found[name] = version(package)
+            try:
+                found[name] = version(package)
+            except PackageNotFoundError:
+                found[name] = "of unknown version"
     return found, missing
 
 

@@ -221,7 +221,7 @@ def _processes(bench: _Bench) -> Iterator[Row]:
         command = ["-m", "grr_torch.cli.main"]
         seconds = median_process_seconds(
             {
-                "build": [*command, "build", "--robot", "kinova", "--out", out],
+                "build": [*command, "build", "--robot", "kinova", "--out", out, "--device", str(bench.robot.device)],
                 "import": ["-c", "import torch, pytorch_kinematics"],
                 "help": [*command, "--help"],
                 "typer": ["-c", "import typer; typer.run(lambda: None)"],

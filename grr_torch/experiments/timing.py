@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
+import os
 import platform
 import resource
 import statistics
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +53,11 @@ def _loops(call: Callable[[], Any]) -> int:
 def median_process_seconds(commands: Mapping[str, Sequence[str]], repeats: int) -> dict[str, float]:
     """Median time of whole Python processes [s], each given by its arguments. They run by turns."""
     times: dict[str, list[float]] = {name: [] for name in commands}
+    environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
     for turn in range(repeats + 1):
         for name, arguments in commands.items():
             begin = time.perf_counter()
-            subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
+            subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=environment)
             # the first turn fills the file cache
             if turn:
                 times[name].append(time.perf_counter() - begin)
@@ -63,8 +66,8 @@ def median_process_seconds(commands: Mapping[str, Sequence[str]], repeats: int) 
 
 def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
     """What a function returns in a process of its own, and the most memory that process held [MiB]."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(_with_memory, (function, torch.get_num_threads(), arguments))
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_with_memory, function, torch.get_num_threads(), arguments).result()
 
 
 def _with_memory(function: Callable[..., Any], threads: int, arguments: tuple[Any, ...]) -> tuple[Any, float]:

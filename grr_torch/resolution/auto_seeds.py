@@ -68,8 +68,7 @@ def find_seeds(
     """
     generator = torch.Generator().manual_seed(check_seed(seed))
     candidates = _closed_paths(robot, task, *_medoids(robot, task, graph, generator, tolerances), tolerances)
-    bounds = torch.stack([graph.points.amin(0), graph.points.amax(0)], dim=1).tolist()
-    coarse = staggered_grid([(low, high) for low, high in bounds], min(_COARSE[task.dimension], len(graph.points)))
+    coarse = _coarse(graph, _COARSE[task.dimension])
     progress("choosing seeds", 0, 2)
     maps = _expansions(robot, task, coarse, candidates, tolerances)
     progress("choosing seeds", 1, 2)
@@ -77,6 +76,15 @@ def find_seeds(
     relaxed = _relaxed(robot, task, coarse, maps[best], tolerances)
     progress("choosing seeds", 2, 2)
     return candidates[best[int(_costs(robot, task, coarse, relaxed).argmin())]]
+
+
+def _coarse(graph: TaskGraph, points: int) -> TaskGraph:
+    """A grid over the same box, which is given some thickness where the graph is flat; a small graph itself."""
+    if len(graph.points) <= points:
+        return graph
+    low, high = graph.points.amin(0), graph.points.amax(0)
+    thickness = (0.05 * float((high - low).max()) - 0.5 * (high - low)).clamp(min=0.0)
+    return staggered_grid(torch.stack([low - thickness, high + thickness], dim=1).tolist(), points)
 
 
 def _expansions(

@@ -40,8 +40,11 @@ def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances
         progress: Told what round it is.
     """
     with one_thread(), torch.no_grad():
-        corners = corners[_spread(network, corners, q, tolerances)[0] > _SUSPECT]
-        if len(corners) == 0:
+        everything, start = corners, q
+        spread = _spread(network, corners, q, tolerances)[0]
+        uncertified_before = int((spread > LARGEST_SPREAD).sum())
+        corners = corners[spread > _SUSPECT]
+        if uncertified_before == 0:
             return q
         weight = _WEIGHT * float((1.0 / network.lengths).mean())
         best, fewest = q, torch.inf
@@ -65,8 +68,10 @@ def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances
         spread = _spread(network, corners, q, tolerances)[0]
         if int((spread > LARGEST_SPREAD).sum()) < fewest:
             best = q
+        # cells that were not looked at may have suffered
+        after = int((_spread(network, everything, best, tolerances)[0] > LARGEST_SPREAD).sum())
     progress("certifying", _ROUNDS, _ROUNDS)
-    return best
+    return best if after < uncertified_before else start
 
 
 def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ pairs of neighbouring vertices' configurations that pass the continuity test, th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,8 @@ _STARTS = 40
 _ROUNDS = 12
 # pairs of configurations whose continuity is checked together
 _PAIRS_AT_ONCE = 1 << 16
+# pairs of configurations whose compatibility is held, a byte each
+_MOST_PAIRS = 4_000_000_000
 # moves of the solver: of a descent, for every vertex; and descents
 _MOVES = 1500
 _DESCENTS = 4
@@ -78,14 +81,15 @@ def random_grr(
     Raises:
         ParameterError: `samples` or `nearest` is below 1.
     """
-    if samples < 1:
-        raise ParameterError("samples", samples, "1 or more")
-    if not 1 <= nearest <= samples:
-        raise ParameterError("nearest", nearest, f"1 to {samples}")
+    most = max(1, math.isqrt(_MOST_PAIRS // max(1, len(graph.edges))))
+    if not 1 <= samples <= most:
+        raise ParameterError("samples", samples, f"1 to {most} for {len(graph.edges):,} edges")
+    if nearest < 1:
+        raise ParameterError("nearest", nearest, "1 or more")
     generator = torch.Generator().manual_seed(check_seed(seed))
     pool, counts = _sample(robot, task, graph, samples, tolerances, generator, progress)
     edges = (counts[graph.edges] > 0).all(1).nonzero()[:, 0]
-    compatible = _test_pairs(robot, task, graph, edges, pool, nearest, tolerances, progress)
+    compatible = _test_pairs(robot, task, graph, edges, pool, min(nearest, samples), tolerances, progress)
     solver = _MinConflicts(graph.edges[edges].numpy(), compatible.numpy(), counts.numpy(), np.random.default_rng(seed))
     values = torch.from_numpy(solver.solve(progress))
     configurations = pool[torch.arange(len(pool)), values]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -81,9 +83,11 @@ def _relaxed(roadmap: Roadmap, tolerances: Tolerances, progress: Progress) -> Ro
         lost = roadmap.edges[roadmap.connected & ~connected].unique()
         if len(lost) == 0:
             return replace(roadmap, configurations=configurations, connected=connected)
-        # nothing is lost where both ends are what they were, so this ends
-        moved = (configurations[lost] != roadmap.configurations[lost]).any(1)
-        back = lost[moved] if bool(moved.any()) else vertices
+        moved = (configurations != roadmap.configurations).any(1) & roadmap.resolved
+        if not bool(moved.any()):
+            # an edge was called connected that is not
+            return replace(roadmap, connected=connected)
+        back = lost[moved[lost]] if bool(moved[lost].any()) else moved.nonzero()[:, 0]
         configurations[back] = roadmap.configurations[back]
         stale = torch.isin(roadmap.edges, back).any(1)
 
@@ -99,6 +103,20 @@ def _continuous(roadmap: Roadmap, configurations: Tensor, edges: Tensor, toleran
         configurations[second],
         tolerances=tolerances,
     ).cpu()
+
+
+def check_refinement(parameters: Mapping[str, Any]) -> None:
+    """Checks what a file says of a roadmap before its refinement.
+
+    Raises:
+        ValueError: A figure is missing or is no number.
+    """
+    before = parameters.get("refinement")
+    if before is None:
+        return
+    for name in (*BEFORE, "seconds"):
+        if not isinstance(before, dict) or not isinstance(before.get(name), int | float | None):
+            raise ValueError(f"'refinement' without a number '{name}'")
 
 
 def summary(roadmap: Roadmap, quality: Quality) -> str:

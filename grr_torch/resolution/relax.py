@@ -30,8 +30,6 @@ _GRADIENT_STEPS = 60
 _LONGEST_STEP = 0.3
 # D_q below which a slope counts as none [rad]
 _SHORTEST = 1e-2
-# λ of the null-space projectors
-_LEAST_DAMPING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,8 @@ def gauss_newton_step(network: Network, q: Tensor, damping: float, pulls: Pulls 
     motions = network.motions(q)
     weights = 1.0 / ((motions.square().sum(0) + _SHORTEST**2).sqrt() * network.lengths)
     jacobian = network.task.jacobian(robot.tree.jacobian(robot.tree.frames(q)))
-    projector = null_space_projector(jacobian, _LEAST_DAMPING)
+    # small, but large enough for the pivots of a straight arm
+    projector = null_space_projector(jacobian, torch.finfo(q.dtype).eps ** 0.6)
     edges = network.edges
     if pulls is not None:
         edges = torch.cat([edges, pulls.pairs], dim=1)

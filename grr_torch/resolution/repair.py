@@ -99,12 +99,18 @@ def _reconsider(
     connects = torch.zeros(count, dtype=torch.float64).index_add_(0, starts_of, joined.double())
     had = torch.zeros(len(roadmap.points), dtype=torch.float64)
     had.index_add_(0, roadmap.edges.flatten(), roadmap.connected[:, None].expand(-1, 2).flatten().double())
-    steepness = torch.zeros(count, dtype=torch.float64).index_add_(0, starts_of, torch.where(joined, slopes, 0.0))
-    # most edges first, and of those that connect as many the least steep
-    score = connects - steepness / (1.0 + steepness.max())
+    steepness = torch.zeros(count, dtype=torch.float64).index_add_(
+        0, starts_of, torch.where(joined, slopes, 0.0).double()
+    )
+    lost = torch.zeros(count, dtype=torch.float64).index_add_(
+        0, starts_of, (roadmap.connected[edge] & ~joined).double()
+    )
+    # most edges first, and of those that connect as many the least steep; none that was connected may be lost
+    score = torch.where(lost > 0.0, -torch.inf, connects - steepness / (1.0 + steepness.max()))
     best = torch.full((len(roadmap.points),), -torch.inf, dtype=torch.float64)
     best.scatter_reduce_(0, candidates.vertices, score, "amax")
-    chosen = ((score == best[candidates.vertices]) & (connects > had[candidates.vertices])).nonzero()[:, 0]
+    more = connects > had[candidates.vertices]
+    chosen = ((score == best[candidates.vertices]) & more & (score > -torch.inf)).nonzero()[:, 0]
     # candidates are ordered by vertex: of two that are equal, the first
     chosen = chosen[candidates.vertices[chosen].diff(prepend=torch.tensor([-1])) != 0]
     configurations, connected, wave = roadmap.configurations.clone(), roadmap.connected.clone(), roadmap.wave.clone()
@@ -171,7 +177,7 @@ def _gentlest(roadmap: Roadmap, candidates: _Candidates) -> _Candidates:
     starts_of, ends, _ = _edges_of(roadmap, candidates.vertices)
     moved = distance(candidates.configurations[starts_of], roadmap.configurations[ends], roadmap.robot.continuous.cpu())
     count = len(candidates.vertices)
-    steepness = torch.zeros(count, dtype=torch.float64).index_add_(0, starts_of, moved)
+    steepness = torch.zeros(count, dtype=torch.float64).index_add_(0, starts_of, moved.double())
     order = steepness.argsort()
     order = order[candidates.vertices[order].argsort(stable=True)]
     ordered = candidates.vertices[order]

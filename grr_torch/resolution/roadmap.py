@@ -32,7 +32,8 @@ class Roadmap:
         resolved: (V,) bool, vertices that have a configuration.
         edges: (E, 2) vertex indices of the task graph's edges.
         connected: (E,) bool, edges that passed the continuity check.
-        wave: (V,) int32, the wave of the expansion that resolved a vertex; −1 where unresolved.
+        wave: (V,) int32, the wave of the expansion that resolved a vertex, later numbers where it was repaired;
+            −1 where unresolved.
         reachable: (V,) bool, vertices that are resolved or were reached from a random start; None if not measured.
         parameters: What the roadmap was built with.
         build_seconds: How long the algorithm took.

@@ -19,6 +19,7 @@ from grr_torch.errors import FileFormatError, GrrError
 from grr_torch.output import atomic_write
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.quality import Quality
+from grr_torch.resolution.refine import check_refinement
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.load import make_robot
 from grr_torch.robots.presets import load_preset, robot_names
@@ -82,6 +83,7 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
         task = task_from_json(metadata["task"])
         parameters, seconds = dict(metadata["parameters"]), float(metadata["build_seconds"])
         Tolerances(**parameters["tolerances"])
+        check_refinement(parameters)
     except FileFormatError:
         raise
     except KeyError as error:

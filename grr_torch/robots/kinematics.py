@@ -120,7 +120,7 @@ class KinematicTree:
 
     def tool_pose(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Tool position (3, N) [m] and rotation (3, 3, N): second index counts the tool's axes."""
-        axes, position = frames[-2].split((3, 1))
+        axes, position = frames[-2].split_with_sizes((3, 1))
         return position[0], axes.transpose(0, 1)
 
     def link_pose(self, frames: Tensor, link: str) -> Tensor:

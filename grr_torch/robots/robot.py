@@ -105,7 +105,7 @@ class Robot:
         Raises:
             ParameterError: The last axis is not n.
         """
-        position, rotation = self._of_frames(self.tree.tool_pose, self.columns(q))
+        position, rotation = self._of_frames(self._tool_pose, self.columns(q))
         return _rows(position, q), _rows(rotation, q)
 
     def jacobian(self, q: Tensor) -> Tensor:
@@ -132,7 +132,7 @@ class Robot:
             ParameterError: The last axis is not n.
         """
         position, rotation, jacobian = self._of_frames(
-            lambda frames: (*self.tree.tool_pose(frames), self.tree.jacobian(frames)), self.columns(q)
+            lambda frames: (*self._tool_pose(frames), self.tree.jacobian(frames)), self.columns(q)
         )
         return _rows(position, q), _rows(rotation, q), _rows(jacobian, q)
 
@@ -235,6 +235,11 @@ class Robot:
         if kernel is None:
             return torch.zeros(columns.shape[1], dtype=torch.bool, device=columns.device)
         return self._of_frames(lambda frames: (kernel.collides(frames, self.margin),), columns)[0]
+
+    def _tool_pose(self, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """`KinematicTree.tool_pose` in memory of its own, so that what is kept does not keep all frames."""
+        position, rotation = self.tree.tool_pose(frames)
+        return position.clone(), rotation.clone()
 
     def _of_frames(self, function: Callable[[Tensor], tuple[Tensor, ...]], columns: Tensor) -> tuple[Tensor, ...]:
         """What a function makes of the frames of columns (n, N), a piece at a time."""

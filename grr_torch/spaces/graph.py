@@ -48,6 +48,8 @@ class TaskGraph:
         if not inside or bool(((edges < 0) | (edges >= len(points))).any()):
             shape = f"{edges.dtype} of shape {tuple(edges.shape)}"
             raise ParameterError("edges of a graph", shape, f"torch.int64 of shape (E, 2), from 0 to {len(points) - 1}")
+        if not bool((edges[:, 0] < edges[:, 1]).all()):
+            raise ParameterError("edges of a graph", "one whose first vertex is not the smaller one", "pairs a < b")
         if self.lattice is None and _some_coincide(points.numpy()):
             raise ParameterError("points of a graph", "two that coincide", "points that differ")
 
@@ -99,6 +101,9 @@ class Copies(TaskGraph):
     """
 
     base: TaskGraph | None = None
+
+    def __post_init__(self) -> None:
+        """Nothing: the graph that is copied was checked, and copies coincide."""
 
     @staticmethod
     def of(base: TaskGraph, count: int) -> Copies:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ class Lattice:
 
     def neighbours(self, vertices: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """Indices (F, K) and distances (F, K) [m] of the k nearest vertices, as `TaskGraph.neighbours` gives them."""
-        displacements, lengths = (part.to(vertices.device) for part in self._stencil(k))
+        displacements, lengths = (part.to(vertices.device) for part in _stencil(self, k))
         index = vertices.new_zeros(len(vertices), len(lengths))
         inside = torch.ones_like(index, dtype=torch.bool)
         corners = math.prod(count + 1 for count in self.cells)
@@ -65,21 +66,23 @@ class Lattice:
             rest = rest // size
         return coordinates[::-1]
 
-    def _stencil(self, k: int) -> tuple[Tensor, Tensor]:
-        """Displacements (K, d) in half cells and their lengths (K,) [m], nearest first."""
-        reach = 2
-        while True:
-            box = itertools.product(range(-reach, reach + 1), repeat=len(self.cells))
-            offsets = [o for o in box if any(o) and len({axis % 2 for axis in o}) == 1]
-            lengths = [math.hypot(*(0.5 * a * s for a, s in zip(o, self.spacing, strict=True))) for o in offsets]
-            order = sorted(range(len(offsets)), key=lambda i: (lengths[i], offsets[i]))
-            # whatever lies outside the box is farther than its nearest face
-            if len(order) >= k and lengths[order[k - 1]] < 0.5 * (reach + 1) * min(self.spacing):
-                break
-            if reach > 2 * max(self.cells):
-                break
-            reach += 1
-        last = lengths[order[min(k, len(order)) - 1]] * (1.0 + 1e-9)
-        order = [i for i in order if lengths[i] <= last]
-        kept = [offsets[i] for i in order]
-        return torch.tensor(kept), torch.tensor([lengths[i] for i in order], dtype=torch.float64)
+
+@functools.lru_cache(maxsize=32)
+def _stencil(lattice: Lattice, k: int) -> tuple[Tensor, Tensor]:
+    """Displacements (K, d) in half cells and their lengths (K,) [m], nearest first; none longer than the grid."""
+    limits = [2 * count for count in lattice.cells]
+    half = [0.5 * length for length in lattice.spacing]
+    reach = 2
+    while True:
+        axes = [range(-min(reach, limit), min(reach, limit) + 1) for limit in limits]
+        offsets = [o for o in itertools.product(*axes) if any(o) and len({axis % 2 for axis in o}) == 1]
+        lengths = [math.hypot(*(a * s for a, s in zip(o, half, strict=True))) for o in offsets]
+        order = sorted(range(len(offsets)), key=lambda i: (lengths[i], offsets[i]))
+        # whatever lies outside the box is farther than the nearest face that can still move out
+        growing = [(reach + 1) * s for s, limit in zip(half, limits, strict=True) if reach < limit]
+        if not growing or (len(order) >= k and lengths[order[k - 1]] < min(growing)):
+            break
+        reach += 1
+    last = lengths[order[min(k, len(order)) - 1]] * (1.0 + 1e-9)
+    order = [i for i in order if lengths[i] <= last]
+    return torch.tensor([offsets[i] for i in order]), torch.tensor([lengths[i] for i in order], dtype=torch.float64)
