@@ -141,6 +141,8 @@ def _seeds(arm: Any, seeds: str | None) -> Any:
         raise ParameterError("--seeds", "preset", f"auto or a file: {arm.name} has no preset")
     if seeds in (None, "preset", "auto"):
         return "auto" if seeds == "auto" else None
+    if not Path(seeds).exists() and not Path(seeds).suffix:
+        raise ParameterError("--seeds", repr(seeds), "preset, auto, or a .csv, .txt or .npy file")
     return read_seeds(seeds)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from public_arms import IIWA_14, PANDA, PLANAR_10, arm_urdf
 
 import grr_torch
 from grr_torch.errors import ParameterError, SeedError
@@ -90,6 +91,24 @@ def test_an_arm_without_preset_needs_no_seeds(box_arm):
     )
     assert int(roadmap.resolved.sum()) > 10
     assert len(roadmap.parameters["seeds"]) > 0
+
+
+@pytest.mark.parametrize(
+    ("figures", "bounds"),
+    [
+        (PANDA, [(-0.9, 0.9), (-0.9, 0.9), (-0.2, 1.1)]),
+        (IIWA_14, [(-0.9, 0.9), (-0.9, 0.9), (-0.2, 1.1)]),
+        (PLANAR_10, [(-1.0, 1.0), (-1.0, 1.0)]),
+    ],
+)
+def test_seeds_are_found_for_arms_nobody_tuned_anything_for(tmp_path, figures, bounds):
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm_urdf(*figures))
+    arm = grr_torch.load_robot(path)
+    task = grr_torch.Position(len(bounds))
+    quality = grr_torch.build(arm, task, points=400, bounds=bounds, reachability=10).quality()
+    assert quality.coverage > 0.95
+    assert quality.connectivity > 0.85
 
 
 def test_where_nothing_is_reached_no_seeds_are_found(kinova):
