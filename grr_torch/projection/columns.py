@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from grr_torch.pieces import FEW
+
 
 def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Tensor:
     """Steps (n, N) = Jᵀ (J Jᵀ + λ)⁻¹ e: of all steps that reduce the error as much, the shortest.
@@ -16,6 +18,12 @@ def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Te
         error: (m, N).
         damping: (N,) λ > 0.
     """
+    if jacobian.shape[2] <= FEW:
+        rows = jacobian.permute(2, 0, 1)
+        normal = rows @ rows.mT
+        normal.diagonal(dim1=1, dim2=2).add_(damping[:, None])
+        factor = torch.linalg.cholesky_ex(normal)[0]
+        return (rows.mT @ torch.cholesky_solve(error.T[..., None], factor))[..., 0].T
     # a joint at a time: all products at once would leave the cache
     first, *others = jacobian.unbind(1)
     normal = first[:, None] * first

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from grr_torch.progress import Progress, silent
 from grr_torch.resolution.cells import Cells, measure_cells, squares, triangles
 from grr_torch.resolution.quality import Quality, measure_quality
 from grr_torch.robots.robot import Robot
@@ -18,6 +19,8 @@ from grr_torch.spaces.task import TaskSpace
 
 if TYPE_CHECKING:
     import networkx
+
+    from grr_torch.applications.solve import Solution, Solver
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +82,38 @@ class Roadmap:
     def _cells(self) -> tuple[Cells, Cells]:
         corners = triangles(self.edges[self.connected], len(self.points)), squares(self)
         return measure_cells(self, corners[0]), measure_cells(self, corners[1])
+
+    @cached_property
+    def uncertified(self) -> tuple[Tensor, Tensor]:
+        """Corners (C, 3) and (C, 4) of the triangles and faces that are not certified. Roadmap files hold them."""
+        triangles_, squares_ = self.cells()
+        return triangles_.corners[~triangles_.certified], squares_.corners[~squares_.certified]
+
+    @cached_property
+    def solver(self) -> Solver:
+        """Tables for `solve`, made when they are first needed."""
+        from grr_torch.applications.solve import Solver
+
+        return Solver(self)
+
+    def solve(self, points: Tensor, *, progress: Progress = silent) -> Solution:
+        """The map as an IK solver: one configuration for any points of the task space (Section IV-E of the paper).
+
+        Each point's guess is the weighted, circular average over its nearest resolved vertices, of which only those in
+        the largest part that edges of the map connect count. It is projected onto the point as in building, with the
+        same limits and self-collision.
+
+        Args:
+            points: (*batch, width) points [m]; one or a million.
+            progress: Told how many are solved.
+
+        Returns:
+            Configurations, which of them are valid, and a status that says why not.
+
+        Raises:
+            ParameterError: The width is not the task's, a value is not finite, or no vertex is resolved.
+        """
+        return self.solver(points, progress=progress)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the roadmap to one safetensors file (`.grr`), by an atomic rename.

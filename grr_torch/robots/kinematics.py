@@ -16,8 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# up to so many configurations the number of torch calls is the cost, not the arithmetic
-_FEW = 16
+from grr_torch.pieces import FEW
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class KinematicTree:
         """
         if torch.is_grad_enabled() and q.requires_grad:
             return _Frames.apply(q, self)  # type: ignore[no-untyped-call]
-        if q.shape[1] <= _FEW:
+        if q.shape[1] <= FEW:
             return self._frames_of_few(q)
         return self._frames_of_many(q, self.workspace(q, q.shape[1]) if workspace is None else workspace)
 
@@ -136,7 +135,7 @@ class KinematicTree:
         lines = frames[: self.n] if self._plain_path else frames[list(self.path)]
         axes = lines[:, 2]
         arms = frames[-2, 3] - lines[:, 3]
-        if frames.shape[3] <= _FEW:
+        if frames.shape[3] <= FEW:
             rows = torch.cat([torch.linalg.cross(axes, arms, dim=1), axes], dim=1).transpose(0, 1)
         else:
             # torch's own cross product takes three times as long

@@ -54,6 +54,53 @@ class Lattice:
             rings.append(torch.stack([low[0], high[0], high[1], low[1]], dim=1))
         return torch.cat(rings)
 
+    def pyramids(self, offsets: Tensor) -> Tensor:
+        """(N,) the pyramid that each point lies in: a cell's centre over one of its faces; −1 outside the grid.
+
+        In the plane, pyramids are the triangles of a centre and an edge. A cell has 2d of them, counted by axis, the
+        lower face first.
+
+        Args:
+            offsets: (N, d) points as seen from the grid's first corner [m].
+        """
+        cells = torch.tensor(self.cells, device=offsets.device)
+        steps = offsets / offsets.new_tensor(self.spacing)
+        # what rounding puts outside still counts
+        inside = ((steps > -1e-9) & (steps < cells + 1e-9)).all(1)
+        cell = torch.minimum(steps.floor().long().clamp_min(0), cells - 1)
+        from_centre = steps - cell - 0.5
+        axis = from_centre.abs().argmax(1)
+        upper = from_centre.gather(1, axis[:, None])[:, 0] > 0
+        return torch.where(inside, self._pyramid(2 * cell + 1, axis, upper), -1)
+
+    def pyramids_at(self, corners: Tensor) -> Tensor:
+        """(P,) the pyramids that triangles (C, 3), smallest vertex first, or square faces (C, 4) bound."""
+        count, sides = corners.shape
+        d = len(self.cells)
+        place = torch.stack(self._coordinates(corners.reshape(-1)), dim=-1).reshape(count, sides, d)
+        if sides == 3:
+            # an edge and a centre: the edge lies on one face of the centre's cell in the plane, on two in space
+            centre = place[:, 2]
+            ends = place[:, :2] - centre[:, None]
+            which, axis = (ends[:, 0] == ends[:, 1]).nonzero().unbind(1)
+            return self._pyramid(centre[which], axis, ends[which, 0, axis] > 0)
+        low, high = place.amin(1), place.amax(1)
+        axis = (low == high).long().argmax(1)
+        found: list[Tensor] = []
+        for upper in (False, True):
+            centre = (low + high) // 2 + (1 - 2 * upper) * torch.nn.functional.one_hot(axis, d)
+            level = centre.gather(1, axis[:, None])[:, 0]
+            inside = (level > 0) & (level < 2 * torch.tensor(self.cells, device=corners.device)[axis])
+            found.append(self._pyramid(centre[inside], axis[inside], upper))
+        return torch.cat(found)
+
+    def _pyramid(self, centre: Tensor, axis: Tensor, upper: Tensor | bool) -> Tensor:
+        """Pyramids over faces of cells, whose centres (P, d) are given in half cells."""
+        cell = torch.zeros_like(axis)
+        for count, coordinate in zip(self.cells, centre.unbind(1), strict=True):
+            cell = cell * count + (coordinate >> 1)
+        return 2 * len(self.cells) * cell + 2 * axis + upper
+
     def _coordinates(self, vertices: Tensor) -> list[Tensor]:
         """(F,) coordinates of vertices along each axis, in half cells."""
         corners = math.prod(count + 1 for count in self.cells)

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from grr_torch.pieces import FEW
+
 
 def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Tensor:
     """Rotation matrix (3, 3) of fixed-axis (extrinsic) xyz Euler angles [rad]."""
@@ -69,13 +71,16 @@ def rotation_error(target: Tensor, rotation: Tensor) -> Tensor:
     Norms reach π; there, where the axis is not unique, one of the two is taken. 27 multiply-adds, an arctangent.
     """
     # vee(T Rᵀ − R Tᵀ) / 2 = ½ Σ columns r × t = axis · sin(angle)
-    twisted = torch.stack(
-        [
-            (rotation[1] * target[2] - rotation[2] * target[1]).sum(0),
-            (rotation[2] * target[0] - rotation[0] * target[2]).sum(0),
-            (rotation[0] * target[1] - rotation[1] * target[0]).sum(0),
-        ]
-    ).mul_(0.5)
+    if rotation.shape[2] <= FEW:
+        twisted = 0.5 * torch.linalg.cross(rotation, target.expand_as(rotation), dim=0).sum(1)
+    else:
+        twisted = torch.stack(
+            [
+                (rotation[1] * target[2] - rotation[2] * target[1]).sum(0),
+                (rotation[2] * target[0] - rotation[0] * target[2]).sum(0),
+                (rotation[0] * target[1] - rotation[1] * target[0]).sum(0),
+            ]
+        ).mul_(0.5)
     cosine = 0.5 * ((rotation * target).sum((0, 1)) - 1.0)
     sine = twisted.square().sum(0).sqrt()
     tiny = sine < 1e-7

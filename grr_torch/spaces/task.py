@@ -97,8 +97,10 @@ class TaskSpace(ABC):
         """
         d = self.dimension
         translation = start[..., :d] + fraction * (end[..., :d] - start[..., :d])
+        if self.width == d:
+            return translation
         orientations = self.quaternions(start), self.quaternions(end)
-        if start.shape[-1] == d or orientations[0] is None or orientations[1] is None:
+        if orientations[0] is None or orientations[1] is None:
             return translation
         return torch.cat([translation, slerp(orientations[0], orientations[1], fraction)], dim=-1)
 

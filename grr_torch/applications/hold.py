@@ -1,0 +1,71 @@
+"""The nearest point to a target that a roadmap can solve: what an arm goes to while the target cannot be reached."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor
+
+from grr_torch.applications.solve import Solver
+from grr_torch.spaces.configuration import distance
+
+# metres around the last such point that are searched in a step, and the shares of it that are tried
+_AROUND = 0.05
+_SHARES = (1.0, 0.4, 0.15, 0.05)
+# a step between neighbouring points may change the configuration by so much a metre [rad/m], and so much in all [rad]
+_SLOPE = 30.0
+_LEAST = 0.05
+# a vertex is gone to instead when it is so much nearer, as a share of the distance
+_NEARER = 0.8
+
+
+def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+    """One step of a search for the solvable point nearest to each target.
+
+    Points round the last one found are solved, towards the target and in the directions of a grid. The nearest to
+    the target is taken if the map leads there without a jump. Where a resolved vertex is much nearer to the target,
+    as on the other side of a hole, that is taken.
+
+    Args:
+        solver: The roadmap's solver.
+        base: (B, width) points found in the last step, or where the tools are.
+        base_q: (B, n) configurations there; NaN where none is known.
+        targets: (B, width) targets.
+
+    Returns:
+        Points (B, width) and configurations (B, n).
+    """
+    count, width = base.shape
+    directions = torch.cat([targets - base, *_directions(base)], dim=1).reshape(count, -1, width)
+    apart = (targets - base).norm(dim=1).clamp_max(_AROUND)
+    directions = directions / directions.norm(dim=2, keepdim=True).clamp_min(1e-12) * apart[:, None, None]
+    steps = torch.cat([share * directions for share in _SHARES], dim=1)
+    points = torch.cat([base[:, None], base[:, None] + steps], dim=1)
+    q, codes = solver.solve_columns(points.reshape(-1, width).T.contiguous())
+    q = q.T.reshape(count, points.shape[1], -1)
+    known = base_q.isfinite().all(1)
+    reach = _SLOPE * (points - base[:, None]).norm(dim=2) + _LEAST
+    near = distance(q, base_q[:, None].nan_to_num(), solver.robot.continuous) <= reach
+    fits = (codes <= 1).to(q.device).reshape(count, -1) & (near | ~known[:, None])
+    score = torch.where(fits, (points - targets[:, None]).norm(dim=2), torch.inf)
+    best = score.argmin(1)
+    rows = torch.arange(count, device=q.device)
+    found, found_q = points[rows, best], q[rows, best]
+    # a point that the map no longer solves is better than none
+    kept = ~score[rows, best].isfinite() & known
+    found, found_q = torch.where(kept[:, None], base, found), torch.where(kept[:, None], base_q, found_q)
+    distances, vertices = solver.nearest(targets.cpu())
+    lost = ~found_q.isfinite().all(1).cpu()
+    over = lost | (distances[:, 0] < _NEARER * (found - targets).norm(dim=1).cpu())
+    return (
+        torch.where(over[:, None].to(q.device), solver.points[vertices[:, 0]].to(q), found),
+        torch.where(over[:, None].to(q.device), solver.configurations[vertices[:, 0]].to(q), found_q),
+    )
+
+
+def _directions(base: Tensor) -> list[Tensor]:
+    """Unit directions to a grid's neighbours: along the axes, and through the corners and edges of its cells."""
+    d = base.shape[1]
+    offsets = [offset for offset in itertools.product((-1.0, 0.0, 1.0), repeat=d) if any(offset)]
+    return [base.new_tensor(offset).expand(len(base), -1) for offset in offsets]

@@ -1,0 +1,191 @@
+"""What arms do next: straight on, on a route over the roadmap, along the edge of reach, or back to the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from grr_torch.applications.hold import nearest_feasible
+from grr_torch.applications.lines import Follower, Lines
+from grr_torch.applications.rejoin import clearance, rejoin
+from grr_torch.applications.routes import Routes
+from grr_torch.applications.solve import Solver
+from grr_torch.spaces.configuration import difference, distance
+
+TRACKING, DETOURING, HOLDING, UNREACHABLE = range(4)
+
+# vertices that are tried as the first of a route, as its last, and as a way back to the map
+_ENTRIES = 6
+_ENDS = 8
+_WAYS_BACK = 32
+# an arm so near [rad or m] to a vertex's configuration is at the vertex
+_ARRIVED = 1e-6
+# rotation errors up to so many tolerances are made good on the way; with larger ones an arm is off its task
+_OFF_TASK = 10.0
+
+
+@dataclass(eq=False)
+class Arms:
+    """Where arms stand and what they are about; B of them.
+
+    Attributes:
+        q: (B, n) configurations, continuous joints not wrapped.
+        p: (B, width) where their tools are.
+        on_task: (B,) arms that meet their task's rotation and the joint limits and are free of self-collision.
+        held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
+        held_q: (B, n) configurations there.
+        next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
+    """
+
+    q: Tensor
+    p: Tensor
+    on_task: Tensor
+    held: Tensor
+    held_q: Tensor
+    next_vertex: Tensor
+
+    @staticmethod
+    def at(follower: Follower, q: Tensor) -> Arms:
+        """Arms that stand at configurations (B, n)."""
+        nothing = q.new_full((len(q), follower.task.width), torch.nan)
+        arms = Arms(q, nothing, torch.zeros(len(q), dtype=torch.bool), nothing.clone(), q * torch.nan, torch.full((len(q),), -1))
+        arms.look(follower)
+        return arms
+
+    def look(self, follower: Follower) -> None:
+        """Finds out where the tools are, and which arms are on their task."""
+        robot, task = follower.robot, follower.task
+        position, rotation = robot.forward_kinematics(self.q)
+        self.p = position[:, : task.dimension]
+        error = task.error(self.p.T, position.T, rotation.permute(1, 2, 0))
+        turned = task.residuals(error)[1] <= _OFF_TASK * follower.tolerances.rotation
+        self.on_task = turned & robot.within_limits(self.q) & ~robot.in_self_collision(self.q)
+
+
+class Pilot:
+    """Decides the next step of arms that are given targets."""
+
+    def __init__(self, follower: Follower, solver: Solver, routes: Routes) -> None:
+        self.follower, self.solver, self.routes = follower, solver, routes
+
+    def steps(self, arms: Arms, which: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+        """Next configurations (A, n) and status codes (A,) of some arms (A,) with targets (A, width)."""
+        guesses, codes = self.solver.guess(targets.cpu())
+        known = (codes <= 1).to(targets.device)
+        q, p = arms.q[which], arms.p[which]
+        lines = self.follower.follow(q, p, torch.where(known[:, None], guesses.to(q), q), targets)
+        valid = known & lines.converged & ~lines.collides
+        direct = valid & lines.direct & arms.on_task[which]
+        result, status = lines.steps, torch.full((len(which),), TRACKING)
+        tracking = which[direct]
+        arms.held[tracking] = arms.held_q[tracking] = torch.nan
+        arms.next_vertex[tracking] = -1
+        rest = (~direct).nonzero()[:, 0]
+        if len(rest):
+            result[rest], status[rest] = self._indirect(arms, which[rest], targets[rest], valid[rest], lines.ends[rest])
+        return result, status
+
+    def _indirect(
+        self, arms: Arms, which: Tensor, targets: Tensor, valid: Tensor, ends: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """`steps` of arms that cannot go straight to their targets; `ends` are configurations where `valid`."""
+        goals, goals_q = targets.clone(), ends.clone()
+        result, status = arms.q[which].clone(), torch.full((len(which),), DETOURING)
+        left = torch.ones_like(valid)
+        lost = (~valid).nonzero()[:, 0]
+        if len(lost):
+            those = which[lost]
+            unset = arms.held[those].isnan().any(1)
+            base = torch.where(unset[:, None], arms.p[those], arms.held[those])
+            goals[lost], goals_q[lost] = nearest_feasible(self.solver, base, arms.held_q[those], targets[lost])
+            arms.held[those], arms.held_q[those] = goals[lost], goals_q[lost]
+            lines = self.follower.follow(arms.q[those], arms.p[those], goals_q[lost], goals[lost])
+            straight = lines.direct & arms.on_task[those]
+            result[lost[straight]], left[lost[straight]] = lines.steps[straight], False
+            status[lost[straight]] = UNREACHABLE
+            arms.next_vertex[those[straight]] = -1
+        routed = (left & arms.on_task[which]).nonzero()[:, 0]
+        if len(routed):
+            result[routed], left[routed] = self._route(arms, which[routed], goals[routed], goals_q[routed])
+        for row in left.nonzero()[:, 0].tolist():
+            step = self._back(arms, int(which[row]), goals_q[row])
+            if step is None:
+                status[row] = HOLDING
+            else:
+                result[row] = step
+        return result, status
+
+    def _route(self, arms: Arms, which: Tensor, goals: Tensor, goals_q: Tensor) -> tuple[Tensor, Tensor]:
+        """Steps (A, n) of arms on shortest paths to goals, and which found no way (A,)."""
+        result, left = arms.q[which].clone(), torch.ones(len(which), dtype=torch.bool)
+        ends = self._last_vertices(goals, goals_q)
+        entries = self.solver.nearest(arms.p[which].cpu(), _ENTRIES)[1]
+        for fresh in (False, True):
+            # where the next vertex of a route cannot be gone to any more, a new way in is looked for
+            rows = (left & ((arms.next_vertex[which] >= 0) | fresh)).nonzero()[:, 0].tolist()
+            tried: list[tuple[int, int, float, bool]] = []
+            for row in rows:
+                cost, following = self.routes.towards(ends[row])
+                ahead = entries[row].tolist() if fresh else _ahead(int(arms.next_vertex[which[row]]), following)
+                on_edge = 0 if fresh else 1 + self._arrived(arms, int(which[row]))
+                tried += [(row, v, float(cost[v]), k < on_edge) for k, v in enumerate(ahead) if cost[v] < float("inf")]
+            if tried:
+                self._enter(arms, which, result, left, tried)
+        return result, left
+
+    def _arrived(self, arms: Arms, arm: int) -> bool:
+        """Whether an arm is at the vertex that its route led to."""
+        there = self.solver.configurations[arms.next_vertex[arm]].to(arms.q)
+        return bool(distance(arms.q[arm], there, self.follower.robot.continuous) < _ARRIVED)
+
+    def _enter(
+        self, arms: Arms, which: Tensor, result: Tensor, left: Tensor, tried: list[tuple[int, int, float, bool]]
+    ) -> None:
+        """Sends arms (A,) to that of their vertices from which the way is shortest, if one can be gone to.
+
+        Args:
+            arms: All arms.
+            which: (A,) those that are routed.
+            result: (A, n) their next configurations, which are set.
+            left: (A,) those that have no next configuration yet.
+            tried: Row in `which`, vertex, length of the way from there, and whether the arm is on an edge that leads
+                there, which is known to be continuous.
+        """
+        owner, vertex = torch.tensor([item[0] for item in tried]), torch.tensor([item[1] for item in tried])
+        q, p = arms.q[which[owner]], arms.p[which[owner]]
+        placed, points = self.solver.configurations[vertex].to(q), self.solver.points[vertex].to(q)
+        lines = self.follower.follow(q, p, placed, points)
+        passable = lines.direct | (lines.safe & torch.tensor([item[3] for item in tried]))
+        total = q.new_tensor([item[2] for item in tried]) + distance(q, placed, self.follower.robot.continuous)
+        total = torch.where(passable, total, torch.inf)
+        for row in dict.fromkeys(item[0] for item in tried):
+            mine = (owner == row).nonzero()[:, 0]
+            # of equal ways, the one that leads on
+            best = mine[len(mine) - 1 - total[mine].flip(0).argmin()]
+            if bool(total[best] < torch.inf):
+                result[row], left[row] = lines.steps[best], False
+                arms.next_vertex[which[row]] = vertex[best]
+
+    def _last_vertices(self, goals: Tensor, goals_q: Tensor) -> list[int]:
+        """Of the vertices round each goal, the one whose configuration is most like the goal's."""
+        vertices = self.solver.nearest(goals.cpu(), _ENDS)[1]
+        apart = distance(self.solver.configurations[vertices].to(goals_q), goals_q[:, None], self.follower.robot.continuous)
+        return vertices.gather(1, apart.cpu().argmin(1)[:, None])[:, 0].tolist()
+
+    def _back(self, arms: Arms, arm: int, goal_q: Tensor) -> Tensor | None:
+        """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near."""
+        arms.next_vertex[arm] = -1
+        here, code = self.solver.solve_columns(arms.p[arm][:, None])
+        vertices = self.solver.nearest(arms.p[arm][None].cpu(), _WAYS_BACK)[1][0]
+        ends = torch.cat([goal_q[None], here.T, self.solver.configurations[vertices].to(goal_q)])
+        return rejoin(self.follower, arms.q[arm], ends[ends.isfinite().all(1)])
+
+
+def _ahead(vertex: int, following: object) -> list[int]:
+    """A vertex and the next two on the way from it."""
+    path = [vertex]
+    while len(path) < 3 and following[path[-1]] >= 0:
+        path.append(int(following[path[-1]]))
+    return path

@@ -1,0 +1,56 @@
+"""Shortest paths in the roadmap G_q."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from grr_torch.spaces.configuration import distance
+
+if TYPE_CHECKING:
+    from grr_torch.resolution.roadmap import Roadmap
+
+# goals whose shortest paths are remembered
+_GOALS = 64
+
+
+class Routes:
+    """Shortest paths by D_q along connected edges.
+
+    Attributes:
+        part: (V,) the connected part of the roadmap that a vertex lies in.
+    """
+
+    def __init__(self, roadmap: Roadmap) -> None:
+        first, second = roadmap.edges[roadmap.connected].T
+        q = roadmap.configurations
+        lengths = distance(q[first], q[second], roadmap.robot.continuous.cpu()).numpy()
+        vertices = len(roadmap.points)
+        # equal configurations are not the absence of an edge
+        lengths = np.maximum(lengths, 1e-9)
+        self._graph = csr_matrix((lengths, (first.numpy(), second.numpy())), shape=(vertices, vertices))
+        self.part: np.ndarray = connected_components(self._graph, directed=False)[1]
+        self.towards = lru_cache(_GOALS)(self._towards)
+
+    def _towards(self, goal: int) -> tuple[np.ndarray, np.ndarray]:
+        """Shortest paths to a vertex.
+
+        Returns:
+            Lengths (V,) [rad], inf where there is no path, and the next vertex (V,) on it, negative at the goal and
+            where there is none.
+        """
+        return dijkstra(self._graph, directed=False, indices=goal, return_predecessors=True)
+
+    def between(self, start: int, goal: int) -> list[int]:
+        """Vertices of a shortest path, both ends included; empty if there is none."""
+        following = self.towards(goal)[1]
+        if start != goal and following[start] < 0:
+            return []
+        path = [start]
+        while path[-1] != goal:
+            path.append(int(following[path[-1]]))
+        return path

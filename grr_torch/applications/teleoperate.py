@@ -1,0 +1,216 @@
+"""Teleoperation on a roadmap: the paper's pipeline (Section IV-E), one control step at a time, for any number of arms."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from grr_torch.applications.lines import Follower
+from grr_torch.applications.pilot import HOLDING, Arms, Pilot
+from grr_torch.applications.routes import Routes
+from grr_torch.errors import ParameterError
+from grr_torch.pieces import one_thread
+from grr_torch.projection.project import Tolerances
+
+if TYPE_CHECKING:
+    from grr_torch.resolution.roadmap import Roadmap
+
+# what a status says, by the pilot's codes
+STATUSES = np.array(["tracking", "detouring", "holding", "unreachable"])
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """What arms are to do next.
+
+    Attributes:
+        configuration: (*batch, n) configurations for the next control step [rad or m]; continuous joints are not
+            wrapped, so that a controller may subtract.
+        status: (*batch,) array of text: "tracking" the target; "detouring", on a planned way to it or back to the
+            map; "holding", because the input was refused or there is no way on; "unreachable": the target cannot be
+            reached, and the arm goes to the nearest point that can.
+    """
+
+    configuration: Tensor
+    status: np.ndarray[Any, np.dtype[np.str_]]
+
+
+class Teleoperator:
+    """Follows targets with arms, within their velocity limits and free of self-collision (Section IV-E).
+
+    In every step each arm goes straight to its target's configuration on the map, if the line there is continuous.
+    If not, a way over the roadmap is searched for. Where the target cannot be reached, the arm goes to the nearest
+    point that can, and slides along the edge of what is reachable as the target moves.
+
+    An arm may start anywhere: off the map, outside a limit, in contact. It then goes back by straight joint-space
+    motions, and from a contact never deeper into it.
+    """
+
+    def __init__(
+        self,
+        roadmap: Roadmap,
+        rate: float = 50.0,
+        *,
+        start: Tensor | None = None,
+        max_step: float | Tensor | None = None,
+        acceleration_limits: float | Tensor | None = None,
+        max_jump: float = math.inf,
+        timeout: float = math.inf,
+    ) -> None:
+        """Makes a teleoperator; nothing moves before `step`.
+
+        Args:
+            roadmap: The roadmap.
+            rate: Control steps in a second [Hz].
+            start: (*batch, n) where the arms stand, as measured; by default at the first target's configuration on
+                the map, or at the nearest resolved vertex where it has none.
+            max_step: The most that a joint moves in a step [rad or m], one number or (n,); by default the robot's
+                velocity limits over the rate.
+            acceleration_limits: Of the joints [rad/s² or m/s²], one number or (n,); by default none. An arm that has
+                them never moves so fast that it could not stop free of self-collision.
+            max_jump: A target farther from the last one than this [m] is refused, until `reset`.
+            timeout: An input older than this [s] is refused; see `step`.
+
+        Raises:
+            ParameterError: A parameter is out of its range, or no vertex is resolved.
+        """
+        robot = roadmap.robot
+        if not 0.0 < rate < math.inf:
+            raise ParameterError("rate", rate, "above 0, in Hz")
+        for name, value in (("max_jump", max_jump), ("timeout", timeout)):
+            if not value > 0.0:
+                raise ParameterError(name, value, "above 0")
+        self.roadmap, self.rate, self.max_jump, self.timeout = roadmap, rate, max_jump, timeout
+        longest = robot.velocity_limits / rate if max_step is None else _per_joint("max_step", max_step, robot.lower)
+        self._gain = None
+        if acceleration_limits is not None:
+            self._gain = _per_joint("acceleration_limits", acceleration_limits, robot.lower) / rate**2
+        tolerances = Tolerances(**roadmap.parameters["tolerances"])
+        self._follower = Follower(robot, roadmap.task, tolerances, longest)
+        self._pilot = Pilot(self._follower, roadmap.solver, Routes(roadmap))
+        self._batch: torch.Size = torch.Size()
+        self._arms: Arms | None = None
+        self.reset(start)
+
+    @property
+    def configuration(self) -> Tensor | None:
+        """(*batch, n) where the arms are, as last commanded or reset; None before the first target where none is."""
+        return None if self._arms is None else self._arms.q.reshape(*self._batch, -1).clone()
+
+    def reset(self, configuration: Tensor | None = None) -> None:
+        """Starts anew: the next target is taken wherever it is, and no input is too old.
+
+        Args:
+            configuration: (*batch, n) where the arms stand, as measured; by default where they were commanded to.
+
+        Raises:
+            ParameterError: It is not finite, or its last axis is not n.
+        """
+        robot = self.roadmap.robot
+        if configuration is not None:
+            q = robot.columns(configuration).T
+            if not bool(q.isfinite().all()):
+                raise ParameterError("configuration", "NaN or infinite values", "finite values")
+            self._batch, self._arms = configuration.shape[:-1], Arms.at(self._follower, q.clone())
+        elif self._arms is not None:
+            self._arms = Arms.at(self._follower, self._arms.q)
+        self._last: Tensor | None = None
+        self._speed = None if self._arms is None else torch.zeros_like(self._arms.q)
+        self._now, self._freshest = 0.0, math.inf
+
+    def step(self, target: Tensor, time: float | None = None) -> Command:
+        """One control step.
+
+        A target that is not finite, too far from the last one or too old is refused: the arm holds.
+
+        Args:
+            target: (*batch, width) points of the task space, one for each arm.
+            time: When the target was given [s], on any clock. An input is as old as it has fallen behind the control
+                steps since `reset`, compared with the one that was least behind.
+
+        Returns:
+            The configurations to go to next, and what the arms are doing.
+
+        Raises:
+            ParameterError: The shape is not that of the arms.
+        """
+        task, robot = self.roadmap.task, self.roadmap.robot
+        if not isinstance(target, Tensor) or target.ndim == 0 or target.shape[-1] != task.width:
+            given = tuple(target.shape) if isinstance(target, Tensor) else type(target).__name__
+            raise ParameterError("target", given, f"a tensor of shape (*batch, {task.width})")
+        if self._arms is not None and target.shape[:-1] != self._batch:
+            raise ParameterError("target shape", tuple(target.shape), f"{(*self._batch, task.width)}: one for each arm")
+        targets = target.detach().to(robot.lower).reshape(-1, task.width)
+        with torch.no_grad(), one_thread():
+            accepted = targets.isfinite().all(1) & self._in_time(time)
+            if self._arms is None:
+                self._start(target.shape[:-1], targets)
+            if self._last is not None:
+                # comparison with NaN, where there was no target yet, is false
+                accepted &= ~((targets - self._last).norm(dim=1) > self.max_jump)
+                targets = torch.where(accepted[:, None], targets, self._last)
+            self._last = torch.where(accepted[:, None], targets, torch.nan) if self._last is None else targets
+            return self._advance(accepted, targets)
+
+    def _advance(self, accepted: Tensor, targets: Tensor) -> Command:
+        arms = self._arms
+        assert arms is not None
+        q, codes = arms.q.clone(), torch.full((len(targets),), HOLDING)
+        which = accepted.nonzero()[:, 0]
+        if len(which):
+            q[which], codes[which] = self._pilot.steps(arms, which, targets[which])
+        if self._gain is not None:
+            q = self._with_acceleration_limits(arms.q, q)
+        arms.q = q
+        arms.look(self._follower)
+        return Command(q.reshape(*self._batch, -1).clone(), STATUSES[codes.numpy()].reshape(self._batch))
+
+    def _start(self, batch: torch.Size, targets: Tensor) -> None:
+        """Arms at their first targets."""
+        if not bool(targets.isfinite().all()):
+            raise ParameterError("first target", "NaN or infinite values", "finite values: the arms start there")
+        solver = self.roadmap.solver
+        q, codes = solver.solve_columns(targets.T.contiguous())
+        vertices = solver.nearest(targets.cpu())[1][:, 0]
+        placed = torch.where((codes <= 1).to(q.device)[:, None], q.T, solver.configurations[vertices].to(q))
+        self._batch, self._arms = batch, Arms.at(self._follower, placed)
+        self._speed = torch.zeros_like(placed)
+
+    def _in_time(self, time: float | None) -> bool:
+        """Whether an input is younger than the time-out; the control clock advances."""
+        self._now += 1.0 / self.rate
+        if time is None:
+            return True
+        if not math.isfinite(time):
+            return False
+        behind = self._now - time
+        self._freshest = min(self._freshest, behind)
+        return behind - self._freshest <= self.timeout
+
+    def _with_acceleration_limits(self, q: Tensor, wanted: Tensor) -> Tensor:
+        """Configurations after a step towards the wanted ones from which arms can still stop free of self-collision.
+
+        Braking takes all joints down together, so that it goes on straight; it was checked in the step before.
+        """
+        assert self._gain is not None and self._speed is not None
+        motion = wanted - q
+        # not faster than what can be braked within the rest of the way
+        ...
+        return wanted
+
+
+def _per_joint(name: str, value: float | Tensor, like: Tensor) -> Tensor:
+    """One positive number for each joint (n,).
+
+    Raises:
+        ParameterError: It is not positive, or not one number or n of them.
+    """
+    given = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    if given.shape not in (torch.Size(), like.shape) or not bool((given > 0.0).all()):
+        raise ParameterError(name, value, f"one number above 0, or {len(like)} of them")
+    return given.expand(len(like)).clone()
