@@ -134,3 +134,16 @@ class OutputError(GrrError):
     def __init__(self, path: str | os.PathLike[str], reason: str) -> None:
         self.path, self.reason = Path(path), reason
         super().__init__(f"cannot write {path}: {reason}")
+
+
+class MissingPackageError(GrrError, ImportError):
+    """A package that only a part of grr_torch needs, and that is not installed.
+
+    Attributes:
+        package: Its name.
+        extra: The extra of grr-torch that brings it.
+    """
+
+    def __init__(self, package: str, extra: str, use: str) -> None:
+        self.package, self.extra = package, extra
+        super().__init__(f"{use} needs {package}, which is not installed: pip install 'grr-torch[{extra}]'")

@@ -16,6 +16,8 @@ _SHARES = (1.0, 0.4, 0.15, 0.05)
 # a step between neighbouring points may change the configuration by so much a metre [rad/m], and so much in all [rad]
 _SLOPE = 30.0
 _LEAST = 0.05
+# a radian of joint motion is made if it brings the tool so much nearer [m/rad]
+_WORTH = 0.05
 # a vertex is gone to instead when it is so much nearer, as a share of the distance
 _NEARER = 0.8
 
@@ -42,13 +44,15 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     directions = directions / directions.norm(dim=2, keepdim=True).clamp_min(1e-12) * apart[:, None, None]
     steps = torch.cat([share * directions for share in _SHARES], dim=1)
     points = torch.cat([base[:, None], base[:, None] + steps], dim=1)
-    q, codes = solver.solve_columns(points.reshape(-1, width).T.contiguous())
+    flat = points.reshape(-1, width)
+    q, codes = solver.solve_columns(flat.T.contiguous())
+    fits = ((codes <= 1) & solver.on_map(flat.cpu(), q.T.cpu())).to(q.device).reshape(count, -1)
     q = q.T.reshape(count, points.shape[1], -1)
     known = base_q.isfinite().all(1)
     reach = _SLOPE * (points - base[:, None]).norm(dim=2) + _LEAST
-    near = distance(q, base_q[:, None].nan_to_num(), solver.robot.continuous) <= reach
-    fits = (codes <= 1).to(q.device).reshape(count, -1) & (near | ~known[:, None])
-    score = torch.where(fits, (points - targets[:, None]).norm(dim=2), torch.inf)
+    moved = torch.where(known[:, None], distance(q, base_q[:, None].nan_to_num(), solver.robot.continuous), 0.0)
+    fits &= moved <= reach
+    score = torch.where(fits, (points - targets[:, None]).norm(dim=2) + _WORTH * moved, torch.inf)
     best = score.argmin(1)
     rows = torch.arange(count, device=q.device)
     found, found_q = points[rows, best], q[rows, best]

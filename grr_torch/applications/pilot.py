@@ -11,7 +11,7 @@ from grr_torch.applications.hold import nearest_feasible
 from grr_torch.applications.lines import Follower, Lines
 from grr_torch.applications.rejoin import clearance, rejoin
 from grr_torch.applications.routes import Routes
-from grr_torch.applications.solve import Solver
+from grr_torch.applications.solve import OFF_MAP, Solver
 from grr_torch.spaces.configuration import difference, distance
 
 TRACKING, DETOURING, HOLDING, UNREACHABLE = range(4)
@@ -22,6 +22,8 @@ _ENDS = 8
 _WAYS_BACK = 32
 # an arm so near [rad or m] to a vertex's configuration is at the vertex
 _ARRIVED = 1e-6
+# an arm so near [rad or m] to the map's configuration at its place is on the map
+_ON_MAP = 0.05
 # rotation errors up to so many tolerances are made good on the way; with larger ones an arm is off its task
 _OFF_TASK = 10.0
 
@@ -76,7 +78,8 @@ class Pilot:
         known = (codes <= 1).to(targets.device)
         q, p = arms.q[which], arms.p[which]
         lines = self.follower.follow(q, p, torch.where(known[:, None], guesses.to(q), q), targets)
-        valid = known & lines.converged & ~lines.collides
+        near = distance(lines.ends, guesses.to(q), self.follower.robot.continuous) <= OFF_MAP
+        valid = known & lines.converged & ~lines.collides & near
         direct = valid & lines.direct & arms.on_task[which]
         result, status = lines.steps, torch.full((len(which),), TRACKING)
         tracking = which[direct]
@@ -177,9 +180,11 @@ class Pilot:
     def _back(self, arms: Arms, arm: int, goal_q: Tensor) -> Tensor | None:
         """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near."""
         arms.next_vertex[arm] = -1
-        here, code = self.solver.solve_columns(arms.p[arm][:, None])
         vertices = self.solver.nearest(arms.p[arm][None].cpu(), _WAYS_BACK)[1][0]
-        ends = torch.cat([goal_q[None], here.T, self.solver.configurations[vertices].to(goal_q)])
+        ends = self.solver.configurations[vertices].to(goal_q)
+        here = self.solver.solve_columns(arms.p[arm][:, None])[0].T
+        if not bool(distance(here, arms.q[arm], self.follower.robot.continuous) <= _ON_MAP):
+            ends = torch.cat([goal_q[None], here, ends])
         return rejoin(self.follower, arms.q[arm], ends[ends.isfinite().all(1)])
 
 

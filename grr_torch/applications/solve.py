@@ -16,7 +16,7 @@ from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
-from grr_torch.spaces.configuration import average, embed
+from grr_torch.spaces.configuration import average, distance, embed
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -31,6 +31,8 @@ _AT_ONCE = 1 << 10
 _NEIGHBOURS = {2: 8, 3: 14}
 # no vertex farther than so many of the longest edges counts, and one must lie within one of them
 _FARTHEST = 1.5
+# radians from the average beyond which a configuration is none of the map's
+OFF_MAP = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +143,13 @@ class Solver:
         slack = 1e-9
         codes[((positions < self.low - slack) | (positions > self.high + slack)).any(1)] = _OUTSIDE
         return average(sums, self.robot.continuous.cpu()), codes
+
+    def on_map(self, points: Tensor, q: Tensor) -> Tensor:
+        """Whether configurations (N, n) at points (N, width), all on the CPU, are near the averages there: (N,).
+
+        A projection that ends far from its guess has left the map for a posture that its vertices do not have.
+        """
+        return distance(q, self.guess(points)[0], self.robot.continuous.cpu()) <= OFF_MAP
 
     def nearest(self, points: Tensor, k: int = 1) -> tuple[Tensor, Tensor]:
         """The k nearest resolved vertices of points (N, width) on the CPU: distances (N, k) and vertices (N, k)."""

@@ -1,0 +1,140 @@
+"""The paths of the teleoperation experiment (Section V-D of the paper): drawn from a seed, or read from a file."""
+
+from __future__ import annotations
+
+import math
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from grr_torch.errors import FileFormatError, ParameterError, UnknownNameError, check_seed
+from grr_torch.projection.project import DEFAULT_TOLERANCES, project_columns
+from grr_torch.resolution.roadmap import Roadmap
+
+KINDS = ("line_random", "line_self", "circle_random", "circle_out")
+# kinds whose paths end where they began
+CLOSED = ("circle_random", "circle_out")
+
+# the longest diameter of a circle, as a share of the shortest side of the roadmap's bounds
+_DIAMETER = 0.2
+# points drawn at once, random starts for each that tell whether it is reachable, and draws before it is given up
+_DRAWN = 2048
+_STARTS = 4
+_MOST_DRAWS = 200
+
+
+def draw_paths(roadmap: Roadmap, kind: str, paths: int, *, waypoints: int = 200, seed: int = 0) -> Tensor:
+    """Random paths (paths, waypoints, width) [m].
+
+    Points are drawn uniformly within the roadmap's bounds, and reachable ones kept: those that a projection from
+    one of a few random starts reaches free of self-collision.
+
+    - line_random: between two reachable points.
+    - line_self: from a reachable point to its mirror image in the robot's base, if that is reachable too.
+    - circle_random: on a diameter between two reachable points, in a random plane.
+    - circle_out: the same with one end of the diameter not reachable.
+
+    Args:
+        roadmap: Whose robot, task space and bounds are meant.
+        kind: Of `KINDS`.
+        paths: How many.
+        waypoints: Points of each, ends included.
+        seed: Of the draw.
+
+    Raises:
+        UnknownNameError: No such kind.
+        ParameterError: A number is too small, or no such path was found.
+    """
+    if kind not in KINDS:
+        raise UnknownNameError("kind of path", kind, KINDS)
+    if paths < 1 or waypoints < 2:
+        raise ParameterError("paths and waypoints", (paths, waypoints), "1 or more paths of 2 or more waypoints")
+    generator = torch.Generator().manual_seed(check_seed(seed) + KINDS.index(kind))
+    found: list[Tensor] = []
+    for _ in range(_MOST_DRAWS):
+        start, end = _ends(roadmap, kind, generator)
+        found.append(_line(start, end, waypoints) if kind.startswith("line") else _circle(start, end, waypoints, generator))
+        if sum(map(len, found)) >= paths:
+            return torch.cat(found)[:paths]
+    raise ParameterError("kind of path", kind, f"one of which {paths} can be drawn for this roadmap")
+
+
+def read_paths(path: str | os.PathLike[str], width: int) -> dict[str, Tensor]:
+    """Paths by kind from an npz file that has one array (paths, waypoints, width) for each.
+
+    Raises:
+        FileFormatError: It is missing, no such file, or an array is of another shape or not finite.
+        UnknownNameError: An array is of no known kind.
+    """
+    if not Path(path).is_file():
+        raise FileFormatError(path, "is not a file")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if not isinstance(file, Mapping) or not len(file):
+                raise FileFormatError(path, "is no npz file with arrays in it")
+            arrays = {name: np.asarray(file[name], dtype=np.float64) for name in file}
+    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise FileFormatError(path, f"cannot be read as npz: {error}") from error
+    for name, array in arrays.items():
+        if name not in KINDS:
+            raise UnknownNameError("kind of path", name, KINDS)
+        if array.ndim != 3 or array.shape[2] != width or array.shape[0] < 1 or array.shape[1] < 2:
+            raise FileFormatError(path, f"'{name}' is of shape {array.shape}, not (paths, 2 or more waypoints, {width})")
+        if not np.isfinite(array).all():
+            raise FileFormatError(path, f"'{name}' has values that are not finite")
+    return {kind: torch.from_numpy(arrays[kind].copy()) for kind in KINDS if kind in arrays}
+
+
+def _ends(roadmap: Roadmap, kind: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Starts and ends (K, width) of lines, or of the diameters of circles."""
+    low, high = roadmap.points.amin(0), roadmap.points.amax(0)
+    drawn = low + (high - low) * torch.rand(_DRAWN, len(low), dtype=torch.float64, generator=generator)
+    start = drawn[_reachable(roadmap, drawn, generator)]
+    if kind == "line_random":
+        half = len(start) // 2
+        return start[:half], start[half : 2 * half]
+    if kind == "line_self":
+        end, wanted = -start, True
+    else:
+        length = _DIAMETER * float((high - low).min()) * torch.rand(len(start), 1, dtype=torch.float64, generator=generator)
+        end, wanted = start + length * _directions(len(start), len(low), generator), kind == "circle_random"
+    kept = _reachable(roadmap, end, generator) == wanted
+    return start[kept], end[kept]
+
+
+def _reachable(roadmap: Roadmap, points: Tensor, generator: torch.Generator) -> Tensor:
+    """(K,) points that a projection from one of a few random starts reaches."""
+    robot = roadmap.robot
+    targets = points.repeat_interleave(_STARTS, dim=0).to(robot.lower).T.contiguous()
+    guesses = robot.sample(len(points) * _STARTS, generator).T.contiguous()
+    valid = project_columns(robot, roadmap.task, targets, guesses, DEFAULT_TOLERANCES)[1]
+    return valid.reshape(-1, _STARTS).any(1).cpu()
+
+
+def _directions(count: int, d: int, generator: torch.Generator) -> Tensor:
+    """Random unit vectors (count, d)."""
+    drawn = torch.randn(count, d, dtype=torch.float64, generator=generator)
+    return drawn / drawn.norm(dim=1, keepdim=True)
+
+
+def _line(start: Tensor, end: Tensor, waypoints: int) -> Tensor:
+    fractions = torch.linspace(0.0, 1.0, waypoints, dtype=torch.float64)
+    return start[:, None] + fractions[:, None] * (end - start)[:, None]
+
+
+def _circle(start: Tensor, end: Tensor, waypoints: int, generator: torch.Generator) -> Tensor:
+    """Circles from start over end back to start: in a plane round the diameter that is drawn too."""
+    centre, radius = 0.5 * (start + end), 0.5 * (start - end)
+    if start.shape[1] == 2:
+        across = torch.stack([-radius[:, 1], radius[:, 0]], dim=1)
+    else:
+        normal = torch.linalg.cross(radius, _directions(len(start), 3, generator))
+        across = torch.linalg.cross(normal / normal.norm(dim=1, keepdim=True).clamp_min(1e-12), radius)
+    angles = torch.linspace(0.0, 2.0 * math.pi, waypoints, dtype=torch.float64)[:, None]
+    return centre[:, None] + angles.cos() * radius[:, None] + angles.sin() * across[:, None]
+
