@@ -13,6 +13,7 @@ from grr_torch.applications.sample_manifold import Sampler
 from grr_torch.applications.trace_curves import Curves, End, Tracer
 from grr_torch.errors import ParameterError, check_seed
 from grr_torch.progress import Progress, silent
+from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, point_columns, project_columns
 from grr_torch.resolution.build import check_task
 from grr_torch.resolution.reachability import reach
@@ -25,6 +26,10 @@ _MOST_SAMPLES = 100_000
 _CURVE_STEP, _STEP = 0.05, 0.3
 # samples are this close [m, rad], or as close as is asked for: curves are to be smooth
 _POSITION, _ROTATION = 1e-6, 1e-5
+# a gap [rad] between values of a continuous joint that is no accident of sampling
+_GAP = 0.3
+# samples that a configuration is held against
+_TRIED = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +99,27 @@ class SelfMotionManifold:
         steps = difference(q[:-1], q[1:], self.robot.continuous.cpu())
         return torch.cat([q[:1], q[:1] + steps.cumsum(0)])
 
+    def ranges(self) -> Tensor:
+        """The values (C, n, 2) that each joint takes on each component: lowest and highest, as far as sampled.
+
+        Those of a continuous joint are the shortest arc that holds them, its lower end in [−π, π]; where no gap above
+        0.3 rad is left, all of [−π, π].
+        """
+        turns = self.robot.continuous.cpu()
+        return torch.stack(
+            [_ranges(self.configurations[self.component == label], turns) for label in range(self.components)]
+        )
+
+    def component_of(self, configuration: Tensor) -> int | None:
+        """The component that a configuration (n,) at the point lies on; None if no near sample is joined to it."""
+        q = configuration.to(self.configurations)
+        nearest = distance(self.configurations, q, self.robot.continuous.cpu()).argsort()[:_TRIED]
+        points = self.point.expand(len(nearest), -1)
+        bare = replace(self.robot, spheres=None)
+        there = self.configurations[nearest]
+        joined = is_continuous(bare, self.task, points, points, q.expand_as(there), there, c=0.8, epsilon=0.05).cpu()
+        return int(self.component[nearest[joined][0]]) if bool(joined.any()) else None
+
 
 def self_motion_manifold(
     robot: Robot,
@@ -157,6 +183,17 @@ def self_motion_manifold(
         starts = _starts(bare, task, target, -(-samples // 2), generator, close)
         sampler = Sampler(bare, task, target, float(step), close, generator)
         return _of_samples(robot, task, target, *sampler.components(starts, samples, progress))
+
+
+def _ranges(q: Tensor, continuous: Tensor) -> Tensor:
+    """(n, 2) lowest and highest of configurations (S, n), on the circle where a joint is continuous."""
+    values = q.sort(dim=0).values
+    following = torch.cat([values[1:], values[:1] + 2.0 * math.pi])
+    gap, before = (following - values).max(0)
+    low = values.gather(0, ((before + 1) % len(values))[None])[0]
+    arc = torch.stack([low, low + 2.0 * math.pi - gap], 1)
+    arc[gap < _GAP] = torch.tensor([-math.pi, math.pi]).to(arc)
+    return torch.where(continuous[:, None], arc, torch.stack([values[0], values[-1]], 1))
 
 
 def _target(robot: Robot, task: TaskSpace, point: Tensor | Sequence[float]) -> Tensor:
