@@ -14,9 +14,10 @@ from grr_torch.applications.trace_curves import Curves, End, Tracer
 from grr_torch.errors import ParameterError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
-from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, point_columns, project_columns
+from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, point_columns, project, project_columns
 from grr_torch.resolution.build import check_task
 from grr_torch.resolution.reachability import reach
+from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import difference, distance, embed
 from grr_torch.spaces.task import TaskSpace
@@ -185,6 +186,33 @@ def self_motion_manifold(
         return _of_samples(robot, task, target, *sampler.components(starts, samples, progress))
 
 
+def roadmap_choice(
+    roadmap: Roadmap, point: Tensor | Sequence[float], *, tolerances: Tolerances = DEFAULT_TOLERANCES
+) -> Tensor | None:
+    """The configuration (n,) that a roadmap's nearest resolved vertex leads to at a point.
+
+    That of the vertex itself where the point is one, else its projection onto the point. None where that fails.
+
+    Args:
+        roadmap: The roadmap.
+        point: (width,) the point of the task space.
+        tolerances: Of the projection.
+
+    Raises:
+        ParameterError: The point is not one of the roadmap's task, or not finite.
+    """
+    target = _target(roadmap.robot, roadmap.task, point)[:, 0].cpu()
+    vertices = roadmap.resolved.nonzero()[:, 0]
+    if len(vertices) == 0:
+        return None
+    gaps = roadmap.task.distance(roadmap.points[vertices].to(target), target)
+    vertex = vertices[gaps.argmin()]
+    if float(gaps.min()) == 0.0:
+        return roadmap.configurations[vertex]
+    solved, valid = project(roadmap.robot, roadmap.task, target, roadmap.configurations[vertex], tolerances=tolerances)
+    return solved.cpu() if bool(valid) else None
+
+
 def _ranges(q: Tensor, continuous: Tensor) -> Tensor:
     """(n, 2) lowest and highest of configurations (S, n), on the circle where a joint is continuous."""
     values = q.sort(dim=0).values
@@ -221,7 +249,9 @@ def _starts(
         centre, radius = reach(robot)
         given, middle = (", ".join(f"{value:.4g}" for value in row) for row in (target[:, 0].tolist(), centre.tolist()))
         gap = float((target[: task.dimension, 0].cpu() - centre[: task.dimension]).norm())
-        why = f"it lies {gap:.3g} m from the first joint" if gap > radius else f"none of {count} random starts led there"
+        why = (
+            f"it lies {gap:.3g} m from the first joint" if gap > radius else f"none of {count} random starts led there"
+        )
         valid_points = f"a point that {robot.name} reaches by {task.kind}, within {radius:.3g} m of ({middle})"
         raise ParameterError("point", f"({given}), which is not reachable: {why}", valid_points)
     return solved[:, valid.nonzero()[:, 0]]

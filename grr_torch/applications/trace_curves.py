@@ -65,9 +65,7 @@ class Curves(NamedTuple):
         number[curves] = torch.arange(len(curves), device=curves.device)
         kept = (number[self.curve] >= 0).nonzero()[:, 0]
         kept = kept[number[self.curve[kept]].argsort(stable=True)]
-        return Curves(
-            self.configurations[:, kept], self.tangents[:, kept], number[self.curve[kept]], self.ends[curves]
-        )
+        return Curves(self.configurations[:, kept], self.tangents[:, kept], number[self.curve[kept]], self.ends[curves])
 
 
 def join(parts: list[Curves]) -> Curves:
@@ -200,7 +198,9 @@ class Tracer:
         """Whether this step of each column passes the column's start (n, N), going the way it first went (N,)."""
         motion = difference(q, starts, self.robot.continuous[:, None])
         ahead = (motion * t).sum(0)
-        near = (ahead > 0.0) & (ahead <= 1.01 * reach) & (motion.norm(dim=0) <= 1.3 * reach) & ((t * first).sum(0) > 0.7)
+        near = (
+            (ahead > 0.0) & (ahead <= 1.01 * reach) & (motion.norm(dim=0) <= 1.3 * reach) & ((t * first).sum(0) > 0.7)
+        )
         closes = torch.zeros_like(near)
         columns = near.nonzero()[:, 0]
         if len(columns):

@@ -18,46 +18,49 @@ from grr_torch.output import atomic_write
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.recording import colours
 from grr_torch.recording.chart import Chart
-from grr_torch.recording.ghosts import log_ghosts
+from grr_torch.recording.colours import Colours
 from grr_torch.recording.robot import RecordedRobot
+from grr_torch.recording.self_motion_view import CHART, JOINTS, MOTION, SPACE, blueprint, in_space, line, palette
 from grr_torch.recording.walk import walk
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance
 
-MOTION = "self_motion"
 _RATE = 25.0
-# ghosts in all, and at least of a component
-_GHOSTS, _LEAST = 24, 2
-_SPACE, _CHART = "space", "configuration_space"
+# arms drawn in all, and at least of a component
+_GHOSTS, _LEAST = 48, 5
+_FAINT = (150, 158, 170)
 
 
 def record_self_motion(
     manifolds: Sequence[SelfMotionManifold],
     path: str | os.PathLike[str],
+    choices: Sequence[Tensor | None] = (),
     roadmap: Roadmap | None = None,
-    choices: Sequence[Tensor | None] | None = None,
 ) -> None:
     """Writes a recording (.rrd) of the self-motion manifolds of one or more points, by an atomic rename.
 
-    One manifold: ghost arms, a colour a component. Several: a colour a point, and the roadmap behind them. On the
-    timeline `self_motion` the arm runs through every component while its tool stays. Entities: `space/…` in metres,
-    `configuration_space/…` on the axes of the joints or of their principal directions, `joints/…` as curves.
+    One manifold: ghost arms and the elbow's traces, a colour a component. Several: a colour a point, and the roadmap
+    behind them. On the timeline `self_motion` the arm runs through every component while its tool stays. Entities:
+    `space/…` in metres; `configuration_space/…` with joints as axes: large dots are ends at joint limits, red ones
+    samples in self-collision; `joints/…` as curves over time.
 
     Args:
         manifolds: The manifolds, all of one robot and task.
         path: The file.
-        roadmap: Drawn behind several manifolds.
         choices: For each manifold the configuration (n,) that a roadmap has there, or None.
+        roadmap: Drawn behind several manifolds.
 
     Raises:
-        ParameterError: There is no manifold, or they are of different robots.
+        ParameterError: There is no manifold, they are of different robots, or there are not as many choices.
         OutputError: It cannot be written.
     """
     import rerun as rr
 
     if not manifolds or any(manifold.robot is not manifolds[0].robot for manifold in manifolds):
         raise ParameterError("manifolds", len(manifolds), "one or more, all of one robot")
+    if choices and len(choices) != len(manifolds):
+        raise ParameterError("choices", len(choices), f"{len(manifolds)}, one for each manifold")
     scene = _Scene(tuple(manifolds), tuple(choices or [None] * len(manifolds)), roadmap)
     with atomic_write(path) as temporary:
         recording = rr.RecordingStream("grr_torch")
@@ -69,13 +72,7 @@ def record_self_motion(
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is drawn.
-
-    Attributes:
-        manifolds: The manifolds.
-        choices: A configuration for each, or None.
-        roadmap: Drawn behind several manifolds.
-    """
+    """What is drawn: manifolds, a configuration or None for each, and perhaps a roadmap behind them."""
 
     manifolds: tuple[SelfMotionManifold, ...]
     choices: tuple[Tensor | None, ...]
@@ -85,255 +82,223 @@ class _Scene:
     def robot(self) -> Robot:
         return self.manifolds[0].robot
 
+    @property
+    def several(self) -> bool:
+        return len(self.manifolds) > 1
+
     @cached_property
     def chart(self) -> Chart:
-        return Chart.of(self.robot, torch.cat([manifold.configurations for manifold in self.manifolds]))
+        return Chart.of(self.manifolds)
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(P, 3) positions of the points; those of the plane at z = 0."""
+        """(P, 3) the points."""
         d = self.manifolds[0].task.dimension
-        rows = torch.stack([manifold.point[:d] for manifold in self.manifolds]).numpy()
-        return np.column_stack([rows, np.zeros((len(rows), 3 - d))])
+        return in_space(torch.stack([manifold.point[:d] for manifold in self.manifolds]).numpy())
 
     @cached_property
-    def chosen(self) -> list[tuple[int, Tensor]]:
-        """The manifolds that have a chosen configuration, and it."""
-        return [(number, q) for number, q in enumerate(self.choices) if q is not None]
-
-    def hues(self) -> list[np.ndarray]:
-        """For each manifold a colour (3,) for each component."""
+    def hues(self) -> list[Colours]:
+        """For each manifold the colours (C, 3) of its components."""
         counts = [manifold.components for manifold in self.manifolds]
-        if len(counts) == 1:
-            return [_hues(counts[0])]
-        return [np.repeat(hue[None], count, axis=0) for hue, count in zip(_hues(len(counts)), counts, strict=True)]
+        if not self.several:
+            return [palette(counts[0])]
+        return [np.repeat(hue[None], count, axis=0) for hue, count in zip(palette(len(counts)), counts, strict=True)]
 
     def log(self, recording: Any) -> None:
         robot = RecordedRobot(recording, self.robot)
-        for number, (manifold, hues) in enumerate(zip(self.manifolds, self.hues(), strict=True)):
-            for component, hue in enumerate(hues):
-                self._log_component(recording, number, manifold, component, hue)
-        self._log_space(recording)
-        self._log_box(recording)
-        if self.chosen:
+        for number, manifold in enumerate(self.manifolds):
+            for component in range(manifold.components):
+                self._log_component(recording, number, component)
+                if not self.several:
+                    self._log_ghosts(recording, component)
+        self._log_frame(recording)
+        if any(choice is not None for choice in self.choices):
             self._log_choices(recording)
-        if self.roadmap is not None and len(self.manifolds) > 1:
+        if self.several and self.roadmap is not None:
             self._log_roadmap(recording, self.roadmap)
         self._log_motion(recording, robot)
 
-    def _log_component(
-        self, recording: Any, number: int, manifold: SelfMotionManifold, component: int, hue: np.ndarray
-    ) -> None:
-        """Its samples and edges in configuration space, and ghost arms."""
+    def _log_component(self, recording: Any, number: int, component: int) -> None:
+        """Samples and edges of a component in configuration space."""
         import rerun as rr
 
-        name = f"point_{number + 1}/component_{component + 1}"
+        manifold, hue = self.manifolds[number], self.hues[number][component]
+        entity = f"{CHART}/point_{number + 1}/component_{component + 1}"
         inside = manifold.component == component
-        q = manifold.configurations[inside]
-        a, b = manifold.edges[inside[manifold.edges[:, 0]]].T
-        lines = self.chart.segments(manifold.configurations[a], manifold.configurations[b])
-        curve = manifold.ends is not None
-        shade = (*hue.tolist(), 255 if curve else 60)
-        width = _line(2.2 if curve else 0.4)
-        recording.log(f"{_CHART}/{name}", rr.LineStrips3D(lines, colors=shade, radii=width), static=True)
-        if not curve:
-            dots = rr.Points3D(self.chart.place(q), colors=hue, radii=_line(1.6))
-            recording.log(f"{_CHART}/{name}/samples", dots, static=True)
-        hit = q[~manifold.free[inside]]
-        if len(hit):
-            dots = rr.Points3D(self.chart.place(hit), colors=colours.BROKEN, radii=_line(3.2))
-            recording.log(f"{_CHART}/{name}/self_collision", dots, static=True)
-        if curve and not bool(manifold.closed[component]):
-            tips = rr.Points3D(self.chart.place(q[[0, -1]]), colors=hue, radii=_line(5.0))
-            recording.log(f"{_CHART}/{name}/ends", tips, static=True)
-        if len(self.manifolds) == 1:
-            count = max(_LEAST, _GHOSTS // manifold.components)
-            shown = q[np.linspace(0, len(q) - 1, count + 2).round().astype(int)[1:-1]]
-            log_ghosts(recording, self.robot, f"{_SPACE}/ghosts/{name}", shown, (*hue.tolist(), 70))
+        q, free = manifold.configurations[inside], manifold.free[inside]
+        a, b = manifold.configurations[manifold.edges[inside[manifold.edges[:, 0]]]].unbind(1)
+        lines = self.chart.segments(a, b, component)
+        if manifold.ends is None:
+            recording.log(
+                f"{entity}/edges", rr.LineStrips3D(lines, colors=(*hue.tolist(), 40), radii=line(0.3)), static=True
+            )
+            recording.log(
+                f"{entity}/samples",
+                rr.Points3D(self.chart.place(q, component), colors=hue, radii=line(1.6)),
+                static=True,
+            )
+        else:
+            recording.log(f"{entity}/curve", rr.LineStrips3D(lines, colors=hue, radii=line(2.4)), static=True)
+            if not bool(manifold.closed[component]):
+                tips = rr.Points3D(self.chart.place(q[[0, -1]], component), colors=hue, radii=line(5.0))
+                recording.log(f"{entity}/ends", tips, static=True)
+        if not bool(free.all()):
+            hit = rr.Points3D(self.chart.place(q[~free], component), colors=colours.BROKEN, radii=line(3.2))
+            recording.log(f"{entity}/self_collision", hit, static=True)
 
-    def _log_space(self, recording: Any) -> None:
-        """The points."""
+    def _log_ghosts(self, recording: Any, component: int) -> None:
+        """Arms of the one manifold as lines through their joints, and the way of the joint that moves most."""
         import rerun as rr
 
-        several = len(self.points) > 1
-        hues = np.stack([hues[0] for hues in self.hues()]) if several else colours.TOUR
-        labels = [f"p{k + 1}" for k in range(len(self.points))] if several else ["p"]
-        recording.log(
-            f"{_SPACE}/points",
-            rr.CoordinateFrame(self.robot.base),
-            rr.Points3D(self.points, colors=hues, radii=_line(7.0), labels=labels, show_labels=True),
-            static=True,
-        )
+        manifold, hue = self.manifolds[0], self.hues[0][component]
+        q = manifold.configurations[manifold.component == component]
+        count = min(len(q), max(_LEAST, _GHOSTS // manifold.components))
+        ghosts = self._joint_places(q[np.linspace(0, len(q) - 1, count).round().astype(int)])
+        base = rr.CoordinateFrame(self.robot.base)
+        entity = f"{SPACE}/component_{component + 1}"
+        recording.log(f"{entity}/arms", base, rr.LineStrips3D(ghosts, colors=hue, radii=line(1.4)), static=True)
+        if manifold.ends is not None:
+            ways = self._joint_places(manifold.curve(component))
+            elbow = int(np.ptp(ways, axis=0).max(1).argmax())
+            way = rr.LineStrips3D([ways[:, elbow]], colors=hue, radii=line(3.0))
+            recording.log(f"{entity}/elbow", base, way, static=True)
 
-    def _log_box(self, recording: Any) -> None:
-        """A box around what is shown in configuration space, with the names of its axes."""
+    def _log_frame(self, recording: Any) -> None:
+        """The points, and a box with the names of its axes around configuration space."""
         import rerun as rr
 
-        low, high = self._box()
-        recording.log(
-            f"{_CHART}/box",
-            rr.Boxes3D(mins=[low], sizes=[high - low], colors=(70, 76, 88, 255), radii=_line(0.5)),
-            static=True,
+        shades = np.stack([hues[0] for hues in self.hues]) if self.several else np.array([[255, 255, 255]])
+        labels = [f"p{k + 1}" for k in range(len(self.points))] if self.several else ["p"]
+        dots = rr.Points3D(self.points, colors=shades, radii=line(7.0), labels=labels, show_labels=True)
+        recording.log(f"{SPACE}/points", rr.CoordinateFrame(self.robot.base), dots, static=True)
+        low, high = self.chart.low, self.chart.high
+        box = rr.Boxes3D(
+            mins=[low], sizes=[high - low], colors=(70, 76, 88), radii=line(0.6), fill_mode="MajorWireframe"
         )
-        middles = np.array([np.where(np.arange(3) == k, 0.5 * (low + high), low) for k in range(3)])
-        names = rr.Points3D(middles, colors=(70, 76, 88, 255), radii=_line(0.1), labels=self.chart.names)
-        recording.log(f"{_CHART}/axes", names, static=True)
+        recording.log(f"{CHART}/box", box, static=True)
+        middles = np.where(np.eye(3, dtype=bool), 0.5 * (low + high), low)
+        names = [
+            f"{name} {a:.1f} … {b:.1f}"
+            for name, a, b in zip(self.chart.names, low.tolist(), high.tolist(), strict=True)
+        ]
+        axes = rr.Points3D(middles, colors=_FAINT, radii=line(0.1), labels=names, show_labels=True)
+        recording.log(f"{CHART}/axes", axes, static=True)
 
     def _log_choices(self, recording: Any) -> None:
-        """What the roadmap has at the points, and lines between neighbours that the continuity check lets pass."""
+        """What a roadmap has at the points, and lines between those that the continuity check joins."""
         import rerun as rr
 
-        several = len(self.manifolds) > 1
-        numbers, q = [number for number, _ in self.chosen], torch.stack([q for _, q in self.chosen])
-        labels = [f"q{number + 1}" for number in numbers] if several else ["the roadmap's choice"]
-        dots = rr.Points3D(self.chart.place(q), colors=(255, 255, 255), radii=_line(6.0), labels=labels, show_labels=True)
-        recording.log(f"{_CHART}/roadmap/choices", dots, static=True)
-        hues = self.hues()
-        for number, configuration in self.chosen:
-            hue = hues[number][0] if several else np.array(colours.TOUR[:3])
-            entity = f"{_SPACE}/choices/point_{number + 1}"
-            log_ghosts(recording, self.robot, entity, configuration[None], (*hue.tolist(), 255))
-        first, second = self._neighbours()
-        if len(first):
-            chart = rr.LineStrips3D(self.chart.segments(q[first], q[second]), colors=colours.TOUR, radii=_line(2.5))
-            recording.log(f"{_CHART}/roadmap/path", chart, static=True)
-            lines = np.stack([self.points[np.array(numbers)[side]] for side in (first, second)], axis=1)
-            path = rr.LineStrips3D(lines, colors=colours.TOUR, radii=_line(2.5))
-            recording.log(f"{_SPACE}/path", rr.CoordinateFrame(self.robot.base), path, static=True)
+        numbers = [number for number, choice in enumerate(self.choices) if choice is not None]
+        q = torch.stack([choice for choice in self.choices if choice is not None])
+        labels = [f"q{number + 1}" for number in numbers] if self.several else ["the roadmap's choice"]
+        hues = np.stack([self.hues[number][0] for number in numbers]) if self.several else (255, 255, 255)
+        shown = [self.chart.place(q[k : k + 1], self._order(number)[0]) for k, number in enumerate(numbers)]
+        dots = rr.Points3D(np.concatenate(shown), colors=hues, radii=line(7.0), labels=labels, show_labels=True)
+        recording.log(f"{CHART}/roadmap/choices", dots, static=True)
+        base = rr.CoordinateFrame(self.robot.base)
+        places = self._joint_places(q)
+        recording.log(f"{SPACE}/choices", base, rr.LineStrips3D(places, colors=hues, radii=line(4.0)), static=True)
+        knees = rr.Points3D(places.reshape(-1, 3), colors=(255, 255, 255), radii=line(4.5))
+        recording.log(f"{SPACE}/choices/joints", base, knees, static=True)
+        first, second = self._neighbours(numbers, q)
+        chart = rr.LineStrips3D(self.chart.segments(q[first], q[second], 0), colors=colours.TOUR, radii=line(2.5))
+        recording.log(f"{CHART}/roadmap/path", chart, static=True)
+        points = self.points[np.array(numbers)]
+        lines = np.stack([points[first.numpy()], points[second.numpy()]], axis=1)
+        path = rr.LineStrips3D(lines, colors=colours.TOUR, radii=line(2.5))
+        recording.log(f"{SPACE}/path", base, path, static=True)
 
-    def _neighbours(self) -> tuple[Tensor, Tensor]:
-        """Pairs of chosen configurations, one after the other (of three, also the last and the first), that connect."""
-        count = len(self.chosen)
-        first = torch.arange(count if count == 3 else max(count - 1, 0))
-        second = (first + 1) % max(count, 1)
-        if len(first) == 0:
-            return first, second
-        p = torch.stack([self.manifolds[number].point for number, _ in self.chosen])
-        q = torch.stack([q for _, q in self.chosen])
+    def _neighbours(self, numbers: list[int], q: Tensor) -> tuple[Tensor, Tensor]:
+        """Pairs of choices q (K, n) that connect: each and the next, and of three also the last and the first."""
+        first = torch.arange(len(numbers) if len(numbers) == 3 else len(numbers) - 1)
+        second = (first + 1) % len(numbers)
+        p = torch.stack([self.manifolds[number].point for number in numbers])
         ends = p[first], p[second], q[first], q[second]
         connected = is_continuous(self.robot, self.manifolds[0].task, *ends).cpu()
         return first[connected], second[connected]
 
     def _log_roadmap(self, recording: Any, roadmap: Roadmap) -> None:
-        """The task graph in space, and the roadmap's edges in configuration space, thin."""
+        """The connected edges of a roadmap, thin: in space, and in configuration space."""
         import rerun as rr
 
-        points = roadmap.points[:, : roadmap.task.dimension].numpy()
-        points = np.column_stack([points, np.zeros((len(points), 3 - points.shape[1]))])
-        a, b = roadmap.edges[roadmap.connected].T
-        frame = rr.CoordinateFrame(self.robot.base)
-        grid = rr.LineStrips3D(points[roadmap.edges[roadmap.connected].numpy()], colors=colours.CONNECTED, radii=_line(0.6))
-        recording.log(f"{_SPACE}/roadmap", frame, grid, static=True)
-        lines = self.chart.segments(roadmap.configurations[a], roadmap.configurations[b])
-        mesh = rr.LineStrips3D(lines, colors=(120, 130, 150, 60), radii=_line(0.5))
-        recording.log(f"{_CHART}/roadmap/edges", mesh, static=True)
+        edges = roadmap.edges[roadmap.connected]
+        points = in_space(roadmap.points[:, : roadmap.task.dimension].numpy())
+        grid = rr.LineStrips3D(points[edges.numpy()], colors=colours.CONNECTED, radii=line(0.7))
+        recording.log(f"{SPACE}/roadmap", rr.CoordinateFrame(self.robot.base), grid, static=True)
+        lines = self.chart.segments(roadmap.configurations[edges[:, 0]], roadmap.configurations[edges[:, 1]], 0)
+        recording.log(
+            f"{CHART}/roadmap/edges", rr.LineStrips3D(lines, colors=(84, 94, 112), radii=line(0.6)), static=True
+        )
 
     def _log_motion(self, recording: Any, robot: RecordedRobot) -> None:
         """The arm running through all components, a dot where it is in configuration space, and its joints."""
         import rerun as rr
 
-        parts = [
-            walk(manifold, component, choice)
-            for manifold, choice in zip(self.manifolds, self.choices, strict=True)
-            for component in _order(manifold, choice)
-        ]
+        order = [(number, component) for number in range(len(self.manifolds)) for component in self._order(number)]
+        parts = [walk(self.manifolds[number], component, self.choices[number]) for number, component in order]
         q = torch.cat(parts)
         times = rr.TimeColumn(MOTION, duration=np.arange(len(q)) / _RATE)
         robot.animate(times, q.numpy())
         dots = rr.Points3D.columns(
-            positions=self.chart.place(q), colors=[(255, 255, 255)] * len(q), radii=[_line(8.0)] * len(q)
+            positions=np.concatenate(
+                [self.chart.place(part, component) for part, (_, component) in zip(parts, order, strict=True)]
+            ),
+            colors=[(255, 255, 255)] * len(q),
+            radii=[line(5.0)] * len(q),
         )
-        recording.send_columns(f"{_CHART}/arm", indexes=[times], columns=dots)
-        # curves end with their component
-        last = np.cumsum([len(part) for part in parts]) - 1
+        recording.send_columns(f"{CHART}/arm", indexes=[times], columns=dots)
+        lengths = [len(part) for part in parts]
         values = q.numpy().copy()
-        values[last] = np.nan
-        for index, (name, hue) in enumerate(zip(self.robot.joint_names, _hues(self.robot.n), strict=True)):
-            recording.log(f"joints/{name}", rr.SeriesLines(names=name, colors=hue), static=True)
+        # lines end with their component
+        values[np.cumsum(lengths) - 1] = np.nan
+        for index, (name, hue) in enumerate(zip(self.robot.joint_names, palette(self.robot.n), strict=True)):
+            recording.log(f"{JOINTS}/{name}", rr.SeriesLines(names=name, colors=hue), static=True)
             columns = rr.Scalars.columns(scalars=values[:, index])
-            recording.send_columns(f"joints/{name}", indexes=[times], columns=columns)
+            recording.send_columns(f"{JOINTS}/{name}", indexes=[times], columns=columns)
+        # a band in the colours of the components
+        shade = np.repeat(np.stack([self.hues[number][component] for number, component in order]), lengths, axis=0)
+        recording.log(
+            f"{JOINTS}/component", rr.SeriesPoints(names="component", markers="square", marker_sizes=4.0), static=True
+        )
+        columns = [
+            *rr.Scalars.columns(scalars=np.full(len(q), float(np.nanmin(values)) - 0.7)),
+            *rr.SeriesPoints.columns(colors=shade),
+        ]
+        recording.send_columns(f"{JOINTS}/component", indexes=[times], columns=columns)
 
-    def _box(self) -> tuple[np.ndarray, np.ndarray]:
-        shown = np.concatenate([self.chart.place(manifold.configurations) for manifold in self.manifolds])
-        margin = 0.06 * float(np.ptp(shown, axis=0).max()) + 1e-3
-        return shown.min(0) - margin, shown.max(0) + margin
+    def _order(self, number: int) -> list[int]:
+        """Components of a manifold, the one nearest to its choice first."""
+        manifold, choice = self.manifolds[number], self.choices[number]
+        order = list(range(manifold.components))
+        if choice is None:
+            return order
+        nearest = distance(manifold.configurations, choice, self.robot.continuous.cpu()).argmin()
+        return sorted(order, key=lambda component: component != int(manifold.component[nearest]))
+
+    def _joint_places(self, configurations: Tensor) -> np.ndarray:
+        """(K, L, 3) where the base, the joints and the tool are."""
+        poses = self.robot.link_poses(configurations)
+        links = [self.robot.base, *(joint.child for joint in self.robot.urdf.path(self.robot.base, self.robot.tool))]
+        return np.stack([poses[link][:, :3, 3].cpu().numpy() for link in links], axis=1)
 
     def blueprint(self) -> Any:
-        """Arms on the left; configuration space, and for one point the joints, on the right."""
-        import rerun.blueprint as rrb
-
-        manifold, several = self.manifolds[0], len(self.manifolds) > 1
-        dark = (18, 20, 26)
-        robot = [] if several and self.chosen else ["+ /robot/**"]
-        flat = manifold.task.dimension == 2
-        space = rrb.Spatial3DView(
-            origin="/",
-            contents=[*robot, f"+ /{_SPACE}/**"],
-            name=self._title(),
-            spatial_information=rrb.SpatialInformation(target_frame=self.robot.base, show_axes=False),
-            eye_controls=_camera(*self._extent(), (0.0, -0.02, 1.0) if flat else (0.9, -0.5, 0.35), flat, 1.25),
-            line_grid=False,
-            background=dark,
+        chosen = [choice[None] for choice in self.choices if choice is not None]
+        drawn = chosen if self.several and chosen else [manifold.configurations for manifold in self.manifolds]
+        arms = self._joint_places(torch.cat(drawn)).reshape(-1, 3)
+        curves = np.concatenate(
+            [
+                self.chart.place(manifold.configurations[manifold.component == component], component)
+                for manifold in self.manifolds
+                for component in range(manifold.components)
+            ]
         )
-        chart = rrb.Spatial3DView(
-            origin=f"/{_CHART}",
-            name="configuration space: " + ("a curve for each point" if several else "a colour for each component"),
-            eye_controls=_camera(*self._box(), (0.75, -1.0, 0.55), False, 1.25),
-            line_grid=False,
-            background=dark,
-        )
-        joints = rrb.TimeSeriesView(origin="/joints", name="joints along the components [rad]")
-        right = chart if several else rrb.Vertical(chart, joints, row_shares=[3, 2])
-        return rrb.Blueprint(
-            rrb.Horizontal(space, right, column_shares=[1, 1] if several else [5, 4]),
-            rrb.TimePanel(timeline=MOTION, state="collapsed", play_state="playing", loop_mode="all"),
-            rrb.SelectionPanel(state="hidden"),
-            rrb.BlueprintPanel(state="collapsed"),
-        )
+        flat = self.manifolds[0].task.dimension == 2
+        return blueprint(self.robot.base, self._title(), arms, self.points, self.chart, curves, flat)
 
     def _title(self) -> str:
-        manifold = self.manifolds[0]
-        if len(self.manifolds) > 1:
-            return f"task space: {len(self.manifolds)} points, and the arm that the roadmap has there"
-        place = ", ".join(f"{value:.3g}" for value in manifold.point.tolist())
-        count = manifold.components
-        return f"{self.robot.name}: {count} component{'s' if count > 1 else ''} with the tool at ({place})"
-
-    def _extent(self) -> tuple[np.ndarray, np.ndarray]:
-        """A box that holds the arm wherever it is drawn."""
-        q = torch.cat([manifold.configurations[:: max(1, len(manifold.configurations) // 50)] for manifold in self.manifolds])
-        if len(self.manifolds) > 1 and self.chosen:
-            q = torch.stack([choice for _, choice in self.chosen])
-        poses = self.robot.link_poses(q)
-        places = np.concatenate([pose[:, :3, 3].cpu().numpy() for pose in poses.values()])
-        return places.min(0), places.max(0)
-
-
-def _order(manifold: SelfMotionManifold, choice: Tensor | None) -> list[int]:
-    """Components, the one of the choice first."""
-    order = list(range(manifold.components))
-    if choice is None:
-        return order
-    nearest = distance(manifold.configurations, choice, manifold.robot.continuous.cpu()).argmin()
-    first = int(manifold.component[nearest])
-    return [first, *(component for component in order if component != first)]
-
-
-def _camera(low: np.ndarray, high: np.ndarray, direction: Sequence[float], flat: bool, far: float) -> Any:
-    import rerun.blueprint as rrb
-
-    centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
-    eye = centre + far * size * np.array(direction) / np.linalg.norm(direction)
-    return rrb.EyeControls3D(position=eye, look_target=centre, eye_up=(0, 1, 0) if flat else (0, 0, 1))
-
-
-def _hues(count: int) -> np.ndarray:
-    """(count, 3) colours all round."""
-    return colours.circle(2.0 * np.pi * np.arange(count) / max(count, 1))
-
-
-def _line(width: float) -> Any:
-    """Widths in points of the screen."""
-    import rerun as rr
-
-    return rr.components.Radius.ui_points(width)
+        if self.several:
+            return f"{self.robot.name}, task space: {len(self.points)} points and the roadmap's arm at each"
+        place = ", ".join(f"{value:.3g}" for value in self.manifolds[0].point.tolist())
+        count = self.manifolds[0].components
+        families = f"{count} families of configurations" if count > 1 else "all configurations"
+        return f"{self.robot.name}: {families} with the tool at ({place})"
