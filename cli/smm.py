@@ -127,8 +127,9 @@ def _roadmap(
         raise ParameterError("--point", "nothing", f"a point, or --roadmap: {arm.name} has no preset")
     if rotation is not None:
         raise ParameterError("--rotation", rotation, "none without --point: the preset's is taken")
-    count = _VERTICES if len(arm.preset.problems[kind or arm.preset.default_task].bounds) == 2 else None
-    return build(arm, kind, points=count, progress=progress)
+    problem = arm.preset.problems.get(kind or arm.preset.default_task)
+    coarse = problem is not None and len(problem.bounds) == 2
+    return build(arm, kind, points=_VERTICES if coarse else None, progress=progress)
 
 
 def _triangle(graph: Roadmap) -> list[list[float]]:

@@ -227,7 +227,7 @@ def _ranges(q: Tensor, continuous: Tensor) -> Tensor:
 def _target(robot: Robot, task: TaskSpace, point: Tensor | Sequence[float]) -> Tensor:
     """The point as a column (width, 1)."""
     try:
-        row = torch.as_tensor(point, dtype=robot.dtype, device=robot.device)
+        row = torch.as_tensor(point, device=robot.device)
     except (ValueError, TypeError, RuntimeError) as error:
         raise ParameterError("point", point, f"{task.width} numbers") from error
     if row.ndim != 1:

@@ -253,8 +253,8 @@ class _Scene:
         values[np.cumsum(lengths) - 1] = np.nan
         for index, (name, hue) in enumerate(zip(self.robot.joint_names, palette(self.robot.n), strict=True)):
             recording.log(f"{JOINTS}/{name}", rr.SeriesLines(names=name, colors=hue), static=True)
-            columns = rr.Scalars.columns(scalars=values[:, index])
-            recording.send_columns(f"{JOINTS}/{name}", indexes=[times], columns=columns)
+            scalars = rr.Scalars.columns(scalars=values[:, index])
+            recording.send_columns(f"{JOINTS}/{name}", indexes=[times], columns=scalars)
         # a band in the colours of the components
         shade = np.repeat(np.stack([self.hues[number][component] for number, component in order]), lengths, axis=0)
         recording.log(

@@ -47,7 +47,7 @@ def blueprint(
     space_of_joints = rrb.Spatial3DView(
         origin=f"/{CHART}",
         name=f"configuration space ({axes}): a colour for each {'point' if several else 'component'}",
-        eye_controls=_camera(chart.low, chart.high, _side_of(curves), False, 1.1),
+        eye_controls=_camera(chart.low, chart.high, _side_of(curves, 0.9 if several else 0.45), False, 1.0),
         line_grid=False,
         background=_DARK,
     )
@@ -65,13 +65,13 @@ def blueprint(
     )
 
 
-def _side_of(points: np.ndarray) -> np.ndarray:
-    """The direction from which points (S, 3) cover each other least, from a little above."""
+def _side_of(points: np.ndarray, tilt: float) -> np.ndarray:
+    """The direction from which points (S, 3) cover each other least, tilted to the side and up."""
     directions = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
     side: np.ndarray = directions[-1] * np.sign(directions[-1, 0] + 0.3 * directions[-1, 1] + 1e-9)
     side = np.array([*side[:2] / max(float(np.linalg.norm(side[:2])), 0.2), 0.0])
     turn = np.array([-side[1], side[0], 0.0])
-    return side + 0.45 * turn + np.array([0.0, 0.0, 0.5])
+    return side + tilt * (turn + np.array([0.0, 0.0, 1.0]))
 
 
 def _camera(low: np.ndarray, high: np.ndarray, direction: np.ndarray, flat: bool, far: float) -> Any:
