@@ -204,7 +204,7 @@ def _print(manifold: SelfMotionManifold, choice: Tensor | None) -> None:
             f"{number + 1}{' *' if number == figures['roadmap_component'] else ''}",
             f"{part['samples']:,}",
             {True: "closed", False: "open", None: "no curve"}[part["closed"]],
-            f"{100.0 * part['free']:.0f} %",
+            f"{100.0 * part['free']:.1f} %",
             *(f"{low:.2f} … {high:.2f}" for low, high in part["ranges"].values()),
         ]
         for number, part in enumerate(figures["components"])

@@ -130,7 +130,7 @@ def test_a_curve_of_planar_3_has_the_analytic_length_in_the_degenerate_case(plan
 def test_random_planar_arms_have_the_components_of_their_polygon(tmp_path, n):
     rng = np.random.default_rng(n)
     seen = set()
-    for seed in range(6 if n == 3 else 12):
+    for seed in range(5 if n == 3 else 12):
         lengths = rng.uniform(0.05, 0.5, n)
         lengths[3:] *= rng.uniform(0.1, 1.0)
         radius = rng.uniform(0.0, 0.6) * lengths.sum()
@@ -140,7 +140,9 @@ def test_random_planar_arms_have_the_components_of_their_polygon(tmp_path, n):
             with pytest.raises(ParameterError, match="not reachable"):
                 grr_torch.self_motion_manifold(robot, grr_torch.Position(2), point, samples=50)
             continue
-        manifold = grr_torch.self_motion_manifold(robot, grr_torch.Position(2), point, samples=400, seed=seed)
+        manifold = grr_torch.self_motion_manifold(
+            robot, grr_torch.Position(2), point, samples=60 if n == 3 else 400, seed=seed
+        )
         assert manifold.components == expected
         check(manifold)
         if n == 3:
@@ -283,9 +285,11 @@ def test_the_command_prints_writes_and_refuses(tmp_path):
     count = sum(part["samples"] for point in data["points"] for part in point["components"])
     assert arrays["configurations"].shape == (count, 3)
     assert arrays["component"].max() + 1 == len(arrays["closed"]) == len(arrays["component_point"])
-    table = run("smm", "--robot", "planar_5", "--point", "0.2", "-0.1", "--samples", 50, cwd=tmp_path)
-    assert table.returncode == 0, table.stderr
-    assert "no curve" in table.stdout
+    table = CliRunner().invoke(
+        app, join_bounds(["smm", "--robot", "planar_5", "--point", "0.2", "-0.1", "--samples", "50"])
+    )
+    assert table.exit_code == 0, table.output
+    assert "no curve" in table.output
     for words, message in (
         (("--robot", "planar_3", "--point", 0.5, 0.5), "not reachable"),
         (("--robot", "planar_3", "--point", 0.1), "two or three numbers"),

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from grr_torch.applications.components import joint_ranges, places
 from grr_torch.applications.sample_manifold import Sampler
 from grr_torch.applications.trace_curves import Curves, End, Tracer
 from grr_torch.errors import ParameterError, check_seed
@@ -19,7 +19,7 @@ from grr_torch.resolution.build import check_task
 from grr_torch.resolution.reachability import reach
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.configuration import difference, distance, embed
+from grr_torch.spaces.configuration import difference, distance
 from grr_torch.spaces.task import TaskSpace
 
 _MOST_SAMPLES = 100_000
@@ -27,8 +27,6 @@ _MOST_SAMPLES = 100_000
 _CURVE_STEP, _STEP = 0.05, 0.3
 # samples are this close [m, rad], or as close as is asked for: curves are to be smooth
 _POSITION, _ROTATION = 1e-6, 1e-5
-# a gap [rad] between values of a continuous joint that is no accident of sampling
-_GAP = 0.3
 # samples that a configuration is held against
 _TRIED = 10
 
@@ -108,7 +106,7 @@ class SelfMotionManifold:
         """
         turns = self.robot.continuous.cpu()
         return torch.stack(
-            [_ranges(self.configurations[self.component == label], turns) for label in range(self.components)]
+            [joint_ranges(self.configurations[self.component == label], turns) for label in range(self.components)]
         )
 
     def component_of(self, configuration: Tensor) -> int | None:
@@ -213,21 +211,10 @@ def roadmap_choice(
     return solved.cpu() if bool(valid) else None
 
 
-def _ranges(q: Tensor, continuous: Tensor) -> Tensor:
-    """(n, 2) lowest and highest of configurations (S, n), on the circle where a joint is continuous."""
-    values = q.sort(dim=0).values
-    following = torch.cat([values[1:], values[:1] + 2.0 * math.pi])
-    gap, before = (following - values).max(0)
-    low = values.gather(0, ((before + 1) % len(values))[None])[0]
-    arc = torch.stack([low, low + 2.0 * math.pi - gap], 1)
-    arc[gap < _GAP] = torch.tensor([-math.pi, math.pi]).to(arc)
-    return torch.where(continuous[:, None], arc, torch.stack([values[0], values[-1]], 1))
-
-
 def _target(robot: Robot, task: TaskSpace, point: Tensor | Sequence[float]) -> Tensor:
     """The point as a column (width, 1)."""
     try:
-        row = torch.as_tensor(point, device=robot.device)
+        row = point if isinstance(point, Tensor) else torch.tensor(point, dtype=torch.float64)
     except (ValueError, TypeError, RuntimeError) as error:
         raise ParameterError("point", point, f"{task.width} numbers") from error
     if row.ndim != 1:
@@ -264,7 +251,7 @@ def _of_curves(robot: Robot, task: TaskSpace, target: Tensor, curves: Curves) ->
     # weights by length: the mean of a curve must not depend on where its samples fall
     onward = torch.where(last, 0.0, distance(q, q.roll(-1, 0), robot.continuous))
     weights = onward + onward.roll(1) + 1e-9
-    rank = _places(q, weights, curves.curve, robot.continuous).argsort()
+    rank = places(q, weights, curves.curve, robot.continuous).argsort()
     curves = curves.take(rank)
     samples = torch.arange(len(q), device=q.device)
     starts = torch.searchsorted(curves.curve, torch.arange(len(rank), device=q.device))
@@ -279,19 +266,10 @@ def _of_samples(
     robot: Robot, task: TaskSpace, target: Tensor, q: Tensor, component: Tensor, edges: Tensor
 ) -> SelfMotionManifold:
     """The manifold made of samples (n, S), each in a component (S,), joined by edges (E, 2)."""
-    place = _places(q.T, torch.ones_like(q[0]), component, robot.continuous)
-    component = place.argsort().argsort()[component]
+    where = places(q.T, torch.ones_like(q[0]), component, robot.continuous)
+    component = where.argsort().argsort()[component]
     rank = component.argsort(stable=True)
     return _manifold(robot, task, target, q.T[rank], component[rank], rank.argsort()[edges], None)
-
-
-def _places(q: Tensor, weights: Tensor, component: Tensor, continuous: Tensor) -> Tensor:
-    """A number (C,) for where each component lies: a fixed combination of its mean, so that no symmetry gives ties."""
-    rows = embed(q, continuous)
-    sums = rows.new_zeros(int(component.max()) + 1, rows.shape[1]).index_add_(0, component, weights[:, None] * rows)
-    totals = rows.new_zeros(len(sums)).index_add_(0, component, weights)
-    factors = torch.cos(math.e * torch.arange(1, rows.shape[1] + 1, dtype=rows.dtype, device=rows.device))
-    return (sums / totals[:, None]) @ factors
 
 
 def _manifold(

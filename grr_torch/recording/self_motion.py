@@ -20,7 +20,18 @@ from grr_torch.recording import colours
 from grr_torch.recording.chart import Chart
 from grr_torch.recording.colours import Colours
 from grr_torch.recording.robot import RecordedRobot
-from grr_torch.recording.self_motion_view import CHART, JOINTS, MOTION, SPACE, blueprint, in_space, line, palette
+from grr_torch.recording.self_motion_view import (
+    CHART,
+    JOINTS,
+    MOTION,
+    SPACE,
+    blueprint,
+    in_space,
+    joint_places,
+    line,
+    palette,
+    title,
+)
 from grr_torch.recording.walk import walk
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.robot import Robot
@@ -153,12 +164,12 @@ class _Scene:
         manifold, hue = self.manifolds[0], self.hues[0][component]
         q = manifold.configurations[manifold.component == component]
         count = min(len(q), max(_LEAST, _GHOSTS // manifold.components))
-        ghosts = self._joint_places(q[np.linspace(0, len(q) - 1, count).round().astype(int)])
+        ghosts = joint_places(self.robot, q[np.linspace(0, len(q) - 1, count).round().astype(int)])
         base = rr.CoordinateFrame(self.robot.base)
         entity = f"{SPACE}/component_{component + 1}"
         recording.log(f"{entity}/arms", base, rr.LineStrips3D(ghosts, colors=hue, radii=line(1.4)), static=True)
         if manifold.ends is not None:
-            ways = self._joint_places(manifold.curve(component))
+            ways = joint_places(self.robot, manifold.curve(component))
             elbow = int(np.ptp(ways, axis=0).max(1).argmax())
             way = rr.LineStrips3D([ways[:, elbow]], colors=hue, radii=line(3.0))
             recording.log(f"{entity}/elbow", base, way, static=True)
@@ -196,7 +207,7 @@ class _Scene:
         dots = rr.Points3D(np.concatenate(shown), colors=hues, radii=line(7.0), labels=labels, show_labels=True)
         recording.log(f"{CHART}/roadmap/choices", dots, static=True)
         base = rr.CoordinateFrame(self.robot.base)
-        places = self._joint_places(q)
+        places = joint_places(self.robot, q)
         recording.log(f"{SPACE}/choices", base, rr.LineStrips3D(places, colors=hues, radii=line(4.0)), static=True)
         knees = rr.Points3D(places.reshape(-1, 3), colors=(255, 255, 255), radii=line(4.5))
         recording.log(f"{SPACE}/choices/joints", base, knees, static=True)
@@ -275,16 +286,10 @@ class _Scene:
         nearest = distance(manifold.configurations, choice, self.robot.continuous.cpu()).argmin()
         return sorted(order, key=lambda component: component != int(manifold.component[nearest]))
 
-    def _joint_places(self, configurations: Tensor) -> np.ndarray:
-        """(K, L, 3) where the base, the joints and the tool are."""
-        poses = self.robot.link_poses(configurations)
-        links = [self.robot.base, *(joint.child for joint in self.robot.urdf.path(self.robot.base, self.robot.tool))]
-        return np.stack([poses[link][:, :3, 3].cpu().numpy() for link in links], axis=1)
-
     def blueprint(self) -> Any:
         chosen = [choice[None] for choice in self.choices if choice is not None]
         drawn = chosen if self.several and chosen else [manifold.configurations for manifold in self.manifolds]
-        arms = self._joint_places(torch.cat(drawn)).reshape(-1, 3)
+        arms = joint_places(self.robot, torch.cat(drawn)).reshape(-1, 3)
         curves = np.concatenate(
             [
                 self.chart.place(manifold.configurations[manifold.component == component], component)
@@ -293,12 +298,4 @@ class _Scene:
             ]
         )
         flat = self.manifolds[0].task.dimension == 2
-        return blueprint(self.robot.base, self._title(), arms, self.points, self.chart, curves, flat)
-
-    def _title(self) -> str:
-        if self.several:
-            return f"{self.robot.name}, task space: {len(self.points)} points and the roadmap's arm at each"
-        place = ", ".join(f"{value:.3g}" for value in self.manifolds[0].point.tolist())
-        count = self.manifolds[0].components
-        families = f"{count} families of configurations" if count > 1 else "all configurations"
-        return f"{self.robot.name}: {families} with the tool at ({place})"
+        return blueprint(self.robot.base, title(self.manifolds), arms, self.points, self.chart, curves, flat)

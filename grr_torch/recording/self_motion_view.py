@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
+from grr_torch.applications.self_motion import SelfMotionManifold
 from grr_torch.recording import colours
 from grr_torch.recording.chart import Chart
 from grr_torch.recording.colours import Colours
+from grr_torch.robots.robot import Robot
 
 SPACE, CHART, JOINTS = "space", "configuration_space", "joints"
 MOTION = "self_motion"
@@ -16,13 +20,13 @@ _DARK = (18, 20, 26)
 
 
 def blueprint(
-    base: str, title: str, arms: np.ndarray, points: np.ndarray, chart: Chart, curves: np.ndarray, flat: bool
+    base: str, name: str, arms: np.ndarray, points: np.ndarray, chart: Chart, curves: np.ndarray, flat: bool
 ) -> Any:
     """Arms on the left; configuration space on the right, and for one point the joints below it.
 
     Args:
         base: The frame of the robot's base.
-        title: What is seen on the left.
+        name: What is seen on the left.
         arms: (K, 3) positions that are to be in sight.
         points: (P, 3) the points of the task space.
         chart: The axes of configuration space.
@@ -37,7 +41,7 @@ def blueprint(
     space = rrb.Spatial3DView(
         origin="/",
         contents=["+ /robot/**", f"+ /{SPACE}/**"],
-        name=title,
+        name=name,
         spatial_information=rrb.SpatialInformation(target_frame=base, show_axes=False),
         eye_controls=_camera(arms.min(0), arms.max(0), side, flat, 1.0 if flat else 0.85),
         line_grid=False,
@@ -65,6 +69,16 @@ def blueprint(
     )
 
 
+def title(manifolds: Sequence[SelfMotionManifold]) -> str:
+    """What is seen in space."""
+    name, first = manifolds[0].robot.name, manifolds[0]
+    if len(manifolds) > 1:
+        return f"{name}, task space: {len(manifolds)} points and the roadmap's arm at each"
+    place = ", ".join(f"{value:.3g}" for value in first.point.tolist())
+    families = f"{first.components} families of configurations" if first.components > 1 else "all configurations"
+    return f"{name}: {families} with the tool at ({place})"
+
+
 def _side_of(points: np.ndarray, tilt: float) -> np.ndarray:
     """The direction from which points (S, 3) cover each other least, tilted to the side and up."""
     directions = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
@@ -80,6 +94,13 @@ def _camera(low: np.ndarray, high: np.ndarray, direction: np.ndarray, flat: bool
     centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low))
     eye = centre + far * size * direction / np.linalg.norm(direction)
     return rrb.EyeControls3D(position=eye, look_target=centre, eye_up=(0, 1, 0) if flat else (0, 0, 1))
+
+
+def joint_places(robot: Robot, configurations: Tensor) -> np.ndarray:
+    """Where the base, the joints and the tool are [m]: (K, L, 3) for configurations (K, n)."""
+    poses = robot.link_poses(configurations)
+    links = [robot.base, *(joint.child for joint in robot.urdf.path(robot.base, robot.tool))]
+    return np.stack([poses[link][:, :3, 3].cpu().numpy() for link in links], axis=1)
 
 
 def in_space(points: np.ndarray) -> np.ndarray:
