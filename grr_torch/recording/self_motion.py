@@ -258,8 +258,7 @@ class _Scene:
             radii=[line(5.0)] * len(q),
         )
         recording.send_columns(f"{CHART}/arm", indexes=[times], columns=dots)
-        lengths = [len(part) for part in parts]
-        values = q.numpy().copy()
+        lengths, values = [len(part) for part in parts], q.numpy().copy()
         # lines end with their component
         values[np.cumsum(lengths) - 1] = np.nan
         for index, (name, hue) in enumerate(zip(self.robot.joint_names, palette(self.robot.n), strict=True)):
