@@ -234,12 +234,13 @@ class _Scene:
 
         edges = roadmap.edges[roadmap.connected]
         points = in_space(roadmap.points[:, : roadmap.task.dimension].numpy())
-        grid = rr.LineStrips3D(points[edges.numpy()], colors=colours.CONNECTED, radii=line(0.7))
+        # in space they would hide the arms
+        shade, width = (colours.CONNECTED, 0.7) if roadmap.task.dimension == 2 else (colours.GRID, 0.3)
+        grid = rr.LineStrips3D(points[edges.numpy()], colors=shade, radii=line(width))
         recording.log(f"{SPACE}/roadmap", rr.CoordinateFrame(self.robot.base), grid, static=True)
         lines = self.chart.segments(roadmap.configurations[edges[:, 0]], roadmap.configurations[edges[:, 1]], 0)
-        recording.log(
-            f"{CHART}/roadmap/edges", rr.LineStrips3D(lines, colors=(84, 94, 112), radii=line(0.6)), static=True
-        )
+        mesh = rr.LineStrips3D(lines, colors=(84, 94, 112), radii=line(0.6))
+        recording.log(f"{CHART}/roadmap/edges", mesh, static=True)
 
     def _log_motion(self, recording: Any, robot: RecordedRobot) -> None:
         """The arm running through all components, a dot where it is in configuration space, and its joints."""

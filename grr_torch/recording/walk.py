@@ -12,7 +12,7 @@ from torch import Tensor
 
 from grr_torch.applications.self_motion import SelfMotionManifold
 from grr_torch.projection.project import project
-from grr_torch.spaces.configuration import difference, distance, interpolate
+from grr_torch.spaces.configuration import difference, distance, interpolate, normalise
 
 _STOPS = 6
 # longest step of a frame [rad]
@@ -29,7 +29,8 @@ def walk(manifold: SelfMotionManifold, component: int, start: Tensor | None = No
         return curve
     first = int(distance(curve[:-1], start, turns).argmin())
     once_round = curve[-1] - curve[0]
-    return torch.cat([curve[first:], curve[1 : first + 1] + once_round])
+    way = torch.cat([curve[first:], curve[1 : first + 1] + once_round])
+    return way + (normalise(way[0], turns) - way[0])
 
 
 def _tour(manifold: SelfMotionManifold, component: int) -> Tensor:
