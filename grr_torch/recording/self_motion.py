@@ -40,7 +40,6 @@ from grr_torch.spaces.configuration import distance
 _RATE = 25.0
 # arms drawn in all, and at least of a component
 _GHOSTS, _LEAST = 48, 5
-_FAINT = (150, 158, 170)
 
 
 def record_self_motion(
@@ -192,7 +191,7 @@ class _Scene:
             f"{name} {a:.1f} … {b:.1f}"
             for name, a, b in zip(self.chart.names, low.tolist(), high.tolist(), strict=True)
         ]
-        axes = rr.Points3D(middles, colors=_FAINT, radii=line(0.1), labels=names, show_labels=True)
+        axes = rr.Points3D(middles, colors=(150, 158, 170), radii=line(0.1), labels=names, show_labels=True)
         recording.log(f"{CHART}/axes", axes, static=True)
 
     def _log_choices(self, recording: Any) -> None:
