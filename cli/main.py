@@ -11,6 +11,7 @@ from grr_torch.cli.bench import app as bench
 from grr_torch.cli.build import build
 from grr_torch.cli.info import info
 from grr_torch.cli.robots import robots
+from grr_torch.cli.smm import smm
 from grr_torch.cli.spheres import spheres
 from grr_torch.cli.view import view
 
@@ -25,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for command in (robots, build, info, view, spheres):
+for command in (robots, build, info, view, spheres, smm):
     app.command()(command)
 app.add_typer(bench)
 
@@ -55,19 +56,19 @@ def run(arguments: Sequence[str] | None = None) -> None:
 
 
 def join_bounds(arguments: list[str]) -> list[str]:
-    """Puts the four or six numbers after --bounds into one argument: an option takes a fixed number otherwise."""
+    """Puts the numbers after --bounds or --point into one argument: an option takes a fixed number otherwise."""
     joined: list[str] = []
     position = 0
     while position < len(arguments):
         joined.append(arguments[position])
         position += 1
-        if joined[-1] == "--bounds":
+        if joined[-1] in ("--bounds", "--point"):
             numbers: list[str] = []
             while position < len(arguments) and _is_number(arguments[position]):
                 numbers.append(arguments[position])
                 position += 1
             if numbers:
-                joined[-1] = f"--bounds={' '.join(numbers)}"
+                joined[-1] = f"{joined[-1]}={' '.join(numbers)}"
     return joined
 
 

@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from grr_torch.applications.self_motion import SelfMotionManifold, self_motion_manifold
     from grr_torch.errors import GrrError, GrrWarning
     from grr_torch.projection.continuity import is_continuous
     from grr_torch.projection.project import Tolerances, project
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from grr_torch.version import __version__
 
 _HOMES = {
+    "SelfMotionManifold": "applications.self_motion",
+    "self_motion_manifold": "applications.self_motion",
     "GrrError": "errors",
     "GrrWarning": "errors",
     "is_continuous": "projection.continuity",
@@ -53,6 +56,7 @@ __all__ = [
     "Position",
     "Roadmap",
     "Robot",
+    "SelfMotionManifold",
     "SphereModel",
     "TaskGraph",
     "TaskSpace",
@@ -66,6 +70,7 @@ __all__ = [
     "project",
     "random_graph",
     "robot_names",
+    "self_motion_manifold",
     "staggered_grid",
 ]
 

@@ -1,0 +1,242 @@
+"""`grr-torch smm`."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from grr_torch.cli.show import markdown_table, print_json, progress_bar, reports_errors
+
+from grr_torch.errors import ParameterError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from grr_torch.applications.self_motion import SelfMotionManifold
+    from grr_torch.resolution.roadmap import Roadmap
+    from grr_torch.robots.robot import Robot
+    from grr_torch.spaces.task import TaskSpace
+
+# vertices of the roadmap that is built where none is given, few enough that its edges are seen
+_VERTICES = 120
+
+
+@reports_errors
+def smm(
+    robot: Annotated[
+        str | None, typer.Option(help="A bundled robot (grr-torch robots) or the path of a URDF; the roadmap's.")
+    ] = None,
+    point: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Point of the task space in metres; repeatable: all are drawn together. None: three neighbouring "
+            "vertices of the roadmap.",
+            metavar="X Y [Z]",
+        ),
+    ] = None,
+    task: Annotated[str | None, typer.Option(help="position or fixed-rotation; the preset's default.")] = None,
+    rotation: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Fixed-axis roll, pitch, yaw of the tool in radians; the preset's.", metavar="R P Y"),
+    ] = None,
+    roadmap: Annotated[
+        Path | None,
+        typer.Option(help="Marks what this roadmap has there; for no --point, built if not given.", metavar="FILE.grr"),
+    ] = None,
+    record: Annotated[Path | None, typer.Option(help="Recording to write.", metavar="FILE.rrd")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write all samples here.", metavar="FILE.npz")] = None,
+    samples: Annotated[int, typer.Option(help="Random starts, and most samples of what is no curve.")] = 1000,
+    step: Annotated[float | None, typer.Option(help="Longest step, in radians; 0.05 on curves, else 0.3.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    tool: Annotated[str | None, typer.Option(help="Link whose pose is controlled.")] = None,
+    base: Annotated[str | None, typer.Option(help="Link in whose frame points are given.")] = None,
+    spheres: Annotated[Path | None, typer.Option(help="Sphere file for self-collision (grr-torch spheres).")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+) -> None:
+    """Find all configurations that reach a point: the components of its self-motion manifold.
+
+    Example: grr-torch smm --robot kinova --point 0.5 0.1 0.3 --record smm.rrd
+
+    Example: grr-torch smm --robot planar_3 --record illustration.rrd
+    """
+    from grr_torch.applications.self_motion import roadmap_choice, self_motion_manifold
+    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.recording.self_motion import record_self_motion
+    from grr_torch.robots.load import load_robot
+
+    for path in (record, out):
+        if path is not None:
+            check_writable(path)
+    if record is not None and out is not None and record.resolve() == out.resolve():
+        raise ParameterError("--out", out, "another file than the recording's")
+    with progress_bar() as progress:
+        given = None if robot is None else load_robot(robot, tool=tool, base=base, spheres=spheres)
+        graph = _roadmap(roadmap, given, task, rotation, bool(point), progress)
+        places = _triangle(graph) if graph is not None and not point else [_numbers(text) for text in point or []]
+        arm, space = (graph.robot, graph.task) if graph else (given, _task(given, places, task, rotation))
+        assert arm is not None
+        manifolds = [
+            self_motion_manifold(arm, space, place, samples=samples, step=step, seed=seed, progress=progress)
+            for place in places
+        ]
+        choices = [None if graph is None else roadmap_choice(graph, manifold.point) for manifold in manifolds]
+        # both files appear together, or neither does
+        with ExitStack() as stack:
+            if record is not None:
+                record_self_motion(manifolds, stack.enter_context(atomic_write(record)), choices, graph)
+            if out is not None:
+                _save(stack.enter_context(atomic_write(out)), manifolds, choices)
+    if as_json:
+        print_json({"robot": arm.name, "task": space.to_json(), "points": [*map(_figures, manifolds, choices)]})
+        return
+    for manifold, choice in zip(manifolds, choices, strict=True):
+        _print(manifold, choice)
+    written = ", ".join(str(path) for path in (record, out) if path is not None)
+    if written:
+        typer.echo(f"\nwritten: {written}")
+
+
+def _roadmap(
+    path: Path | None,
+    arm: Robot | None,
+    kind: str | None,
+    rotation: tuple[float, float, float] | None,
+    has_points: bool,
+    progress: Any,
+) -> Roadmap | None:
+    """The roadmap that is given; where there is neither one nor a point, one of the robot's preset."""
+    from grr_torch.resolution.build import build
+    from grr_torch.resolution.roadmap import Roadmap
+
+    if path is not None:
+        graph = Roadmap.load(path)
+        if arm is not None and (arm.name, arm.joint_names) != (graph.robot.name, graph.robot.joint_names):
+            raise ParameterError("--robot", arm.name, f"{graph.robot.name}, the roadmap's, or none")
+        if kind not in (None, graph.task.kind):
+            raise ParameterError("--task", kind, f"{graph.task.kind}, the roadmap's, or none")
+        if rotation is not None and list(rotation) != graph.task.to_json().get("rotation"):
+            raise ParameterError("--rotation", rotation, "the roadmap's, or none")
+        return graph
+    if arm is None:
+        raise ParameterError("--robot", "nothing", "a bundled robot, the path of a URDF, or --roadmap")
+    if has_points:
+        return None
+    if arm.preset is None:
+        raise ParameterError("--point", "nothing", f"a point, or --roadmap: {arm.name} has no preset")
+    if rotation is not None:
+        raise ParameterError("--rotation", rotation, "none without --point: the preset's is taken")
+    problem = arm.preset.problems.get(kind or arm.preset.default_task)
+    coarse = problem is not None and len(problem.bounds) == 2
+    return build(arm, kind, points=_VERTICES if coarse else None, progress=progress)
+
+
+def _triangle(graph: Roadmap) -> list[list[float]]:
+    """Three neighbouring vertices, all joined, as near as there are to two thirds of the way to the farthest one."""
+    import torch
+
+    corners = graph.cells()[0].corners
+    if len(corners) == 0:
+        raise ParameterError("--point", "nothing", "a point: the roadmap has no three vertices that are all joined")
+    middle = graph.points[graph.resolved].mean(0)
+    away = graph.points[corners].mean(1) - middle
+    radius = (graph.points[graph.resolved] - middle).norm(dim=1).max()
+    wanted = radius * torch.nn.functional.normalize(torch.ones_like(middle), dim=0) / 1.5
+    triangle: list[list[float]] = graph.points[corners[(away - wanted).norm(dim=1).argmin()]].tolist()
+    return triangle
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        numbers = [float(value) for value in text.replace(",", " ").split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3):
+        raise ParameterError("--point", repr(text), "two or three numbers: x y [z]")
+    return numbers
+
+
+def _task(
+    arm: Robot | None, places: list[list[float]], kind: str | None, rotation: tuple[float, float, float] | None
+) -> TaskSpace:
+    """The task space that the options ask for, with the preset's rotation where none is given."""
+    from grr_torch.spaces.task import FixedRotation, make_task
+
+    preset = arm.preset if arm else None
+    kind = kind or (FixedRotation.kind if rotation else preset.default_task if preset else "position")
+    dimension = len(places[0])
+    problem = preset.problems.get(kind) if preset else None
+    if rotation is None and problem is not None and len(problem.bounds) == dimension:
+        rotation = problem.rotation
+    return make_task(kind, dimension, rotation)
+
+
+def _figures(manifold: SelfMotionManifold, choice: Tensor | None) -> dict[str, Any]:
+    """What is printed of a manifold."""
+    counts = manifold.component.bincount(minlength=manifold.components).tolist()
+    names, ranges = manifold.robot.joint_names, manifold.ranges().tolist()
+    return {
+        "point": manifold.point.tolist(),
+        "dimension": manifold.dimension,
+        "components": [
+            {
+                "samples": counts[c],
+                "closed": bool(manifold.closed[c]) if manifold.dimension == 1 else None,
+                "free": float(manifold.free[manifold.component == c].double().mean()),
+                "ranges": dict(zip(names, ranges[c], strict=True)),
+            }
+            for c in range(manifold.components)
+        ],
+        "roadmap": None if choice is None else choice.tolist(),
+        "roadmap_component": None if choice is None else manifold.component_of(choice),
+    }
+
+
+def _print(manifold: SelfMotionManifold, choice: Tensor | None) -> None:
+    figures = _figures(manifold, choice)
+    place = ", ".join(f"{value:g}" for value in figures["point"])
+    typer.secho(
+        f"\n{manifold.robot.name}, {manifold.task.kind}, tool at ({place}): dimension {manifold.dimension}", bold=True
+    )
+    rows = [
+        [
+            f"{number + 1}{' *' if number == figures['roadmap_component'] else ''}",
+            f"{part['samples']:,}",
+            {True: "closed", False: "open", None: "no curve"}[part["closed"]],
+            f"{100.0 * part['free']:.1f} %",
+            *(f"{low:.2f} … {high:.2f}" for low, high in part["ranges"].values()),
+        ]
+        for number, part in enumerate(figures["components"])
+    ]
+    head = ["component", "samples", "curve", "free of self-collision", *manifold.robot.joint_names]
+    typer.echo(markdown_table(head, rows))
+    if choice is not None:
+        values = ", ".join(f"{value:.3f}" for value in figures["roadmap"])
+        on = "on no component found" if figures["roadmap_component"] is None else "on the component marked *"
+        typer.echo(f"the roadmap's choice, {on}: {values}")
+
+
+def _save(path: Path, manifolds: list[SelfMotionManifold], choices: list[Tensor | None]) -> None:
+    """All samples as arrays: each with its point, its component (numbered over all points) and whether it is free."""
+    import numpy as np
+    import torch
+
+    firsts = np.cumsum([0, *(manifold.components for manifold in manifolds)])
+    rows = np.cumsum([0, *(len(manifold.configurations) for manifold in manifolds)])
+    nothing = torch.full((manifolds[0].robot.n,), torch.nan)
+    joined = zip(manifolds, firsts, rows, strict=False)
+    parts = [(m.component.numpy() + first, m.edges.numpy() + row) for m, first, row in joined]
+    with path.open("wb") as file:
+        np.savez_compressed(
+            file,
+            joint_names=np.array(manifolds[0].robot.joint_names),
+            points=torch.stack([manifold.point for manifold in manifolds]).numpy(),
+            configurations=torch.cat([manifold.configurations for manifold in manifolds]).numpy(),
+            free=torch.cat([manifold.free for manifold in manifolds]).numpy(),
+            component=np.concatenate([component for component, _ in parts]),
+            edges=np.concatenate([edges for _, edges in parts]),
+            closed=torch.cat([manifold.closed for manifold in manifolds]).numpy(),
+            component_point=np.repeat(np.arange(len(manifolds)), np.diff(firsts)),
+            roadmap=torch.stack([nothing if choice is None else choice for choice in choices]).numpy(),
+        )
