@@ -22,7 +22,7 @@ _SPREAD, _STEEPNESS = 0.2, 5.0
 # and those of the authors' later release for manipulability
 _MANIPULABILITY = (0.5, 0.1)
 # distance [m] over which the nearness of two links falls to 1/e, and the nearness below which it has no gradient
-_NEAR, _FAR = 0.01, 1e-4
+_NEAR, _FAR = 0.01, 1e-3
 # nearness to a limit is this power of the joint's distance from mid-range, as a share of half the range
 _POWER = 20
 # configurations among which the largest manipulability is found
@@ -54,17 +54,17 @@ class Weights:
         velocity: Norm of the motion in a step [rad].
         acceleration: Norm of its change from the last step [rad].
         jerk: Norm of that change's change [rad].
-        self_collision: Nearness of two links: exp(−d / 1 cm), d being what their distance is above the margin.
-        limits: Nearness to joint limits: norm of (q − mid-range)²⁰ in half ranges.
-        manipulability: √det(J Jᵀ) as a share of the robot's largest, which is best.
+        self_collision: Nearness of the closest two links: exp(−d / 1 cm), d what their distance is above the margin.
+        limits: Nearness to joint limits: norm of (q − mid-range)²⁰, in half ranges.
+        manipulability: √det(J Jᵀ) as a share of the robot's largest: the nearer to 1, the better.
     """
 
-    position: float = 60.0
-    orientation: float = 30.0
+    position: float = 1000.0
+    orientation: float = 100.0
     velocity: float = 5.0
     acceleration: float = 4.0
     jerk: float = 6.0
-    self_collision: float = 3.0
+    self_collision: float = 50.0
     limits: float = 1.0
     manipulability: float = 1.0
 
