@@ -44,17 +44,16 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     directions = directions / directions.norm(dim=2, keepdim=True).clamp_min(1e-12) * apart[:, None, None]
     steps = torch.cat([share * directions for share in _SHARES], dim=1)
     points = torch.cat([base[:, None], base[:, None] + steps], dim=1)
-    flat = points.reshape(-1, width)
-    q, codes = solver.solve_columns(flat.T.contiguous())
-    fits = ((codes <= 1) & solver.on_map(flat.cpu(), q.T.cpu())).to(q.device).reshape(count, -1)
-    q = q.T.reshape(count, points.shape[1], -1)
+    columns, codes = solver.solve_columns(points.reshape(-1, width).T.contiguous())
+    q = columns.T.reshape(count, points.shape[1], -1)
+    fits = (codes <= 1).to(base.device).reshape(count, -1)
     known = base_q.isfinite().all(1)
     reach = _SLOPE * (points - base[:, None]).norm(dim=2) + _LEAST
     moved = torch.where(known[:, None], distance(q, base_q[:, None].nan_to_num(), solver.robot.continuous), 0.0)
     fits &= moved <= reach
     score = torch.where(fits, (points - targets[:, None]).norm(dim=2) + _WORTH * moved, torch.inf)
     best = score.argmin(1)
-    rows = torch.arange(count, device=q.device)
+    rows = torch.arange(count, device=base.device)
     found, found_q = points[rows, best], q[rows, best]
     # a point that the map no longer solves is better than none
     kept = ~score[rows, best].isfinite() & known

@@ -84,7 +84,9 @@ class Follower:
         short = pieces <= _MOST_PIECES
         count = int(pieces[short].max()) if bool(short.any()) else 2
         inner = torch.arange(1, count, dtype=q.dtype, device=q.device) / count
-        fractions = torch.cat([inner.expand(len(q), -1), share.clamp_max(1.0)[:, None], torch.ones_like(share)[:, None]], 1)
+        fractions = torch.cat(
+            [inner.expand(len(q), -1), share.clamp_max(1.0)[:, None], torch.ones_like(share)[:, None]], 1
+        )
         # what lies beyond the longest line is not looked at, but for the end
         rows, columns = (short[:, None] | (torch.arange(count + 1) >= count - 1)).nonzero().unbind(1)
         fraction = fractions[rows, columns][:, None]

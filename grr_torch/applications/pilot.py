@@ -11,7 +11,7 @@ from grr_torch.applications.hold import nearest_feasible
 from grr_torch.applications.lines import Follower, Lines
 from grr_torch.applications.rejoin import clearance, rejoin
 from grr_torch.applications.routes import Routes
-from grr_torch.applications.solve import OFF_MAP, Solver
+from grr_torch.applications.solve import Solver
 from grr_torch.spaces.configuration import difference, distance
 
 TRACKING, DETOURING, HOLDING, UNREACHABLE = range(4)
@@ -34,6 +34,7 @@ class Arms:
 
     Attributes:
         q: (B, n) configurations, continuous joints not wrapped.
+        speed: (B, n) what they moved in the last step, where accelerations are limited.
         p: (B, width) where their tools are.
         on_task: (B,) arms that meet their task's rotation and the joint limits and are free of self-collision.
         held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
@@ -42,6 +43,7 @@ class Arms:
     """
 
     q: Tensor
+    speed: Tensor
     p: Tensor
     on_task: Tensor
     held: Tensor
@@ -52,7 +54,8 @@ class Arms:
     def at(follower: Follower, q: Tensor) -> Arms:
         """Arms that stand at configurations (B, n)."""
         nothing = q.new_full((len(q), follower.task.width), torch.nan)
-        arms = Arms(q, nothing, torch.zeros(len(q), dtype=torch.bool), nothing.clone(), q * torch.nan, torch.full((len(q),), -1))
+        off, no_vertex = torch.zeros(len(q), dtype=torch.bool), torch.full((len(q),), -1)
+        arms = Arms(q, torch.zeros_like(q), nothing, off, nothing.clone(), q * torch.nan, no_vertex)
         arms.look(follower)
         return arms
 
@@ -72,27 +75,32 @@ class Pilot:
     def __init__(self, follower: Follower, solver: Solver, routes: Routes) -> None:
         self.follower, self.solver, self.routes = follower, solver, routes
 
-    def steps(self, arms: Arms, which: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-        """Next configurations (A, n) and status codes (A,) of some arms (A,) with targets (A, width)."""
+    def steps(self, arms: Arms, which: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The next step of some arms (A,) that are given targets (A, width).
+
+        Returns:
+            Configurations after it (A, n), what they lead to (A, n), NaN where that is not known, and status codes (A,).
+        """
         guesses, codes = self.solver.guess(targets.cpu())
         known = (codes <= 1).to(targets.device)
         q, p = arms.q[which], arms.p[which]
         lines = self.follower.follow(q, p, torch.where(known[:, None], guesses.to(q), q), targets)
-        near = distance(lines.ends, guesses.to(q), self.follower.robot.continuous) <= OFF_MAP
-        valid = known & lines.converged & ~lines.collides & near
+        valid = known & lines.converged & ~lines.collides & self.solver.on_map(lines.ends, guesses.to(q))
         direct = valid & lines.direct & arms.on_task[which]
-        result, status = lines.steps, torch.full((len(which),), TRACKING)
+        result, ends, status = lines.steps, lines.ends, torch.full((len(which),), TRACKING)
         tracking = which[direct]
         arms.held[tracking] = arms.held_q[tracking] = torch.nan
         arms.next_vertex[tracking] = -1
         rest = (~direct).nonzero()[:, 0]
         if len(rest):
-            result[rest], status[rest] = self._indirect(arms, which[rest], targets[rest], valid[rest], lines.ends[rest])
-        return result, status
+            result[rest], ends[rest], status[rest] = self._indirect(
+                arms, which[rest], targets[rest], valid[rest], lines.ends[rest]
+            )
+        return result, ends, status
 
     def _indirect(
         self, arms: Arms, which: Tensor, targets: Tensor, valid: Tensor, ends: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """`steps` of arms that cannot go straight to their targets; `ends` are configurations where `valid`."""
         goals, goals_q = targets.clone(), ends.clone()
         result, status = arms.q[which].clone(), torch.full((len(which),), DETOURING)
@@ -118,7 +126,7 @@ class Pilot:
                 status[row] = HOLDING
             else:
                 result[row] = step
-        return result, status
+        return result, torch.where(status[:, None] == UNREACHABLE, goals_q, torch.nan), status
 
     def _route(self, arms: Arms, which: Tensor, goals: Tensor, goals_q: Tensor) -> tuple[Tensor, Tensor]:
         """Steps (A, n) of arms on shortest paths to goals, and which found no way (A,)."""
@@ -174,7 +182,9 @@ class Pilot:
     def _last_vertices(self, goals: Tensor, goals_q: Tensor) -> list[int]:
         """Of the vertices round each goal, the one whose configuration is most like the goal's."""
         vertices = self.solver.nearest(goals.cpu(), _ENDS)[1]
-        apart = distance(self.solver.configurations[vertices].to(goals_q), goals_q[:, None], self.follower.robot.continuous)
+        apart = distance(
+            self.solver.configurations[vertices].to(goals_q), goals_q[:, None], self.follower.robot.continuous
+        )
         return vertices.gather(1, apart.cpu().argmin(1)[:, None])[:, 0].tolist()
 
     def _back(self, arms: Arms, arm: int, goal_q: Tensor) -> Tensor | None:

@@ -55,7 +55,9 @@ def leave_contact(follower: Follower, q: Tensor) -> Tensor | None:
         return None
     unit = gradient / gradient.abs().max()
     steps = q + unit.new_tensor(_SHARES)[:, None] * unit * follower.longest.clamp_max(0.1).min()
-    steps = torch.minimum(torch.maximum(steps, torch.minimum(follower.robot.lower, q)), torch.maximum(follower.robot.upper, q))
+    steps = torch.minimum(
+        torch.maximum(steps, torch.minimum(follower.robot.lower, q)), torch.maximum(follower.robot.upper, q)
+    )
     fits = never_deeper(follower, q.expand_as(steps), steps).nonzero()[:, 0]
     return steps[fits[0]] if len(fits) else None
 

@@ -15,15 +15,16 @@ from torch.nn.functional import embedding_bag
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress, silent
+from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
-from grr_torch.spaces.configuration import average, distance, embed
+from grr_torch.spaces.configuration import average, difference, embed
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
 # what a status says; the first two are those of valid configurations
-STATUSES = ("solved", "uncertified", "outside", "too far", "not converged", "self-collision")
-_SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _SELF_COLLISION = range(len(STATUSES))
+STATUSES = ("solved", "uncertified", "outside", "too far", "not converged", "off the map", "self-collision")
+_SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_COLLISION = range(len(STATUSES))
 
 # points worked on together
 _AT_ONCE = 1 << 10
@@ -31,8 +32,8 @@ _AT_ONCE = 1 << 10
 _NEIGHBOURS = {2: 8, 3: 14}
 # no vertex farther than so many of the longest edges counts, and one must lie within one of them
 _FARTHEST = 1.5
-# radians from the average beyond which a configuration is none of the map's
-OFF_MAP = 0.5
+# radians of self-motion from the average beyond which a configuration is none of the map's
+_OFF_MAP = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,8 @@ class Solution:
         valid: (*batch,) bool: the tool is at the point, within limits and free of self-collision.
         status: (*batch,) array of text. Of valid ones: "solved", or "uncertified" in a cell inside which the map may
             not be continuous. Of others: "outside" the roadmap's bounds, "too far" from every resolved vertex, "not
-            converged", or in "self-collision".
+            converged", "off the map", where the projection ends in another posture than the vertices around have, or
+            in "self-collision".
     """
 
     configurations: Tensor
@@ -115,6 +117,9 @@ class Solver:
         )
         codes[near[~valid].cpu()] = _NOT_CONVERGED
         near, solved = near[valid], solved[:, valid]
+        kept = self.on_map(solved.T, guesses.to(targets)[near])
+        codes[near[~kept].cpu()] = _OFF_THE_MAP
+        near, solved = near[kept], solved[:, kept]
         hit = self.robot.columns_in_self_collision(solved)
         codes[near[hit].cpu()] = _SELF_COLLISION
         q[:, near[~hit]] = solved[:, ~hit]
@@ -144,12 +149,22 @@ class Solver:
         codes[((positions < self.low - slack) | (positions > self.high + slack)).any(1)] = _OUTSIDE
         return average(sums, self.robot.continuous.cpu()), codes
 
-    def on_map(self, points: Tensor, q: Tensor) -> Tensor:
-        """Whether configurations (N, n) at points (N, width), all on the CPU, are near the averages there: (N,).
+    def on_map(self, q: Tensor, guesses: Tensor) -> Tensor:
+        """Whether configurations (N, n) are the map's, (N,), as far as the averages (N, n) that led to them tell.
 
-        A projection that ends far from its guess has left the map for a posture that its vertices do not have.
+        A projection that ends far from its guess along the self-motion manifold has left the map for a posture that
+        its vertices do not have. How far it went to reach the point does not count.
         """
-        return distance(q, self.guess(points)[0], self.robot.continuous.cpu()) <= OFF_MAP
+        motion = difference(guesses, q, self.robot.continuous)
+        far = (motion.norm(dim=1) > _OFF_MAP).nonzero()[:, 0]
+        result = q.isfinite().all(1)
+        if len(far):
+            columns = motion[far].T
+            jacobian = self.task.jacobian(self.robot.tree.jacobian(self.robot.tree.frames(q[far].T.contiguous())))
+            moved = (jacobian * columns).sum(1)
+            across = damped_least_squares(jacobian, moved, torch.full_like(moved[0], 1e-6))
+            result[far] &= (columns - across).norm(dim=0) <= _OFF_MAP
+        return result
 
     def nearest(self, points: Tensor, k: int = 1) -> tuple[Tensor, Tensor]:
         """The k nearest resolved vertices of points (N, width) on the CPU: distances (N, k) and vertices (N, k)."""

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from grr_torch.applications.braking import limit_acceleration
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.pilot import HOLDING, Arms, Pilot
 from grr_torch.applications.routes import Routes
@@ -120,7 +121,6 @@ class Teleoperator:
         elif self._arms is not None:
             self._arms = Arms.at(self._follower, self._arms.q)
         self._last: Tensor | None = None
-        self._speed = None if self._arms is None else torch.zeros_like(self._arms.q)
         self._now, self._freshest = 0.0, math.inf
 
     def step(self, target: Tensor, time: float | None = None) -> Command:
@@ -160,12 +160,13 @@ class Teleoperator:
     def _advance(self, accepted: Tensor, targets: Tensor) -> Command:
         arms = self._arms
         assert arms is not None
-        q, codes = arms.q.clone(), torch.full((len(targets),), HOLDING)
+        q, goals, codes = arms.q.clone(), arms.q.clone(), torch.full((len(targets),), HOLDING)
         which = accepted.nonzero()[:, 0]
         if len(which):
-            q[which], codes[which] = self._pilot.steps(arms, which, targets[which])
+            q[which], goals[which], codes[which] = self._pilot.steps(arms, which, targets[which])
         if self._gain is not None:
-            q = self._with_acceleration_limits(arms.q, q)
+            arms.speed = limit_acceleration(self._follower, self._gain, arms.q, arms.speed, q, goals)
+            q = arms.q + arms.speed
         arms.q = q
         arms.look(self._follower)
         return Command(q.reshape(*self._batch, -1).clone(), STATUSES[codes.numpy()].reshape(self._batch))
@@ -179,7 +180,6 @@ class Teleoperator:
         vertices = solver.nearest(targets.cpu())[1][:, 0]
         placed = torch.where((codes <= 1).to(q.device)[:, None], q.T, solver.configurations[vertices].to(q))
         self._batch, self._arms = batch, Arms.at(self._follower, placed)
-        self._speed = torch.zeros_like(placed)
 
     def _in_time(self, time: float | None) -> bool:
         """Whether an input is younger than the time-out; the control clock advances."""
@@ -191,17 +191,6 @@ class Teleoperator:
         behind = self._now - time
         self._freshest = min(self._freshest, behind)
         return behind - self._freshest <= self.timeout
-
-    def _with_acceleration_limits(self, q: Tensor, wanted: Tensor) -> Tensor:
-        """Configurations after a step towards the wanted ones from which arms can still stop free of self-collision.
-
-        Braking takes all joints down together, so that it goes on straight; it was checked in the step before.
-        """
-        assert self._gain is not None and self._speed is not None
-        motion = wanted - q
-        # not faster than what can be braked within the rest of the way
-        ...
-        return wanted
 
 
 def _per_joint(name: str, value: float | Tensor, like: Tensor) -> Tensor:

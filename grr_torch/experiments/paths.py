@@ -24,7 +24,7 @@ CLOSED = ("circle_random", "circle_out")
 _DIAMETER = 0.2
 # points drawn at once, random starts for each that tell whether it is reachable, and draws before it is given up
 _DRAWN = 2048
-_STARTS = 4
+_STARTS = 1
 _MOST_DRAWS = 200
 
 
@@ -58,7 +58,9 @@ def draw_paths(roadmap: Roadmap, kind: str, paths: int, *, waypoints: int = 200,
     found: list[Tensor] = []
     for _ in range(_MOST_DRAWS):
         start, end = _ends(roadmap, kind, generator)
-        found.append(_line(start, end, waypoints) if kind.startswith("line") else _circle(start, end, waypoints, generator))
+        found.append(
+            _line(start, end, waypoints) if kind.startswith("line") else _circle(start, end, waypoints, generator)
+        )
         if sum(map(len, found)) >= paths:
             return torch.cat(found)[:paths]
     raise ParameterError("kind of path", kind, f"one of which {paths} can be drawn for this roadmap")
@@ -84,7 +86,9 @@ def read_paths(path: str | os.PathLike[str], width: int) -> dict[str, Tensor]:
         if name not in KINDS:
             raise UnknownNameError("kind of path", name, KINDS)
         if array.ndim != 3 or array.shape[2] != width or array.shape[0] < 1 or array.shape[1] < 2:
-            raise FileFormatError(path, f"'{name}' is of shape {array.shape}, not (paths, 2 or more waypoints, {width})")
+            raise FileFormatError(
+                path, f"'{name}' is of shape {array.shape}, not (paths, 2 or more waypoints, {width})"
+            )
         if not np.isfinite(array).all():
             raise FileFormatError(path, f"'{name}' has values that are not finite")
     return {kind: torch.from_numpy(arrays[kind].copy()) for kind in KINDS if kind in arrays}
@@ -101,7 +105,9 @@ def _ends(roadmap: Roadmap, kind: str, generator: torch.Generator) -> tuple[Tens
     if kind == "line_self":
         end, wanted = -start, True
     else:
-        length = _DIAMETER * float((high - low).min()) * torch.rand(len(start), 1, dtype=torch.float64, generator=generator)
+        length = (
+            _DIAMETER * float((high - low).min()) * torch.rand(len(start), 1, dtype=torch.float64, generator=generator)
+        )
         end, wanted = start + length * _directions(len(start), len(low), generator), kind == "circle_random"
     kept = _reachable(roadmap, end, generator) == wanted
     return start[kept], end[kept]
@@ -137,4 +143,3 @@ def _circle(start: Tensor, end: Tensor, waypoints: int, generator: torch.Generat
         across = torch.linalg.cross(normal / normal.norm(dim=1, keepdim=True).clamp_min(1e-12), radius)
     angles = torch.linspace(0.0, 2.0 * math.pi, waypoints, dtype=torch.float64)[:, None]
     return centre[:, None] + angles.cos() * radius[:, None] + angles.sin() * across[:, None]
-

@@ -27,8 +27,8 @@ MAX_STEP = 0.04
 # steps after the last waypoint, in which an arm may still arrive
 MORE_STEPS = 100
 
-# an arm has arrived when its tool is so near its goal [m]
-_ARRIVED = 1e-3
+# an arm has arrived when its tool is so near its goal [m] and no joint moves more in a step [rad or m]
+_ARRIVED, _SETTLED = 1e-3, 1e-4
 
 
 class Controller(Protocol):
@@ -126,7 +126,13 @@ def _controller(method: str, roadmap: Roadmap, seed: int, progress: Progress) ->
         "expansion": lambda: _OnRoadmap(roadmap),
         "random": lambda: _OnRoadmap(
             build(
-                roadmap.robot, roadmap.task, points=roadmap.graph, method="random", refine=False, seed=seed, progress=progress
+                roadmap.robot,
+                roadmap.task,
+                points=roadmap.graph,
+                method="random",
+                refine=False,
+                seed=seed,
+                progress=progress,
             )
         ),
         "newton": lambda: NewtonIk(roadmap.robot, roadmap.task, max_step=MAX_STEP),
@@ -155,11 +161,12 @@ def _follow(
     begin = time.perf_counter()
     for step in range(1, given + MORE_STEPS):
         progress(name, step, given + MORE_STEPS)
-        q = controller.step(waypoints[:, min(step, given - 1)])
+        before, q = q, controller.step(waypoints[:, min(step, given - 1)])
         trajectory.append(torch.where(done[:, None], torch.nan, q))
         if step >= given - 1:
             tool = roadmap.robot.forward_kinematics(q)[0][:, : roadmap.task.dimension]
-            done |= (tool - waypoints[:, -1, : roadmap.task.dimension]).norm(dim=1) <= _ARRIVED
+            near = (tool - waypoints[:, -1, : roadmap.task.dimension]).norm(dim=1) <= _ARRIVED
+            done |= near & ((q - before).abs().amax(1) <= _SETTLED)
             if bool(done.all()):
                 break
     progress(name, given + MORE_STEPS, given + MORE_STEPS)
