@@ -210,7 +210,7 @@ class _Projection:
             for part in slices(len(together.columns), every.device):
                 beyond += self._step(batch, together.take(part))
         if self.limits is not None and beyond:
-            together, moved = Equations.join(e for e, _ in beyond), torch.cat([m for _, m in beyond], -1)
+            together, moved = Equations.join([e for e, _ in beyond]), torch.cat([m for _, m in beyond], -1)
             batch.q.index_copy_(1, together.columns, stop_at_limits(self.limits, together, moved))
         return done
 

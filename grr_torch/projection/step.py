@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -38,8 +38,8 @@ class Equations(NamedTuple):
         return Equations(*(tensor[..., which] for tensor in self))
 
     @classmethod
-    def join(cls, parts: Iterable[Equations]) -> Equations:
-        return cls(*(torch.cat(tensors, -1) for tensors in zip(*parts, strict=True)))
+    def join(cls, parts: Sequence[Equations]) -> Equations:
+        return parts[0] if len(parts) == 1 else cls(*(torch.cat(tensors, -1) for tensors in zip(*parts, strict=True)))
 
 
 class Limits(NamedTuple):
