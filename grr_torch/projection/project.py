@@ -236,9 +236,7 @@ class _Projection:
             jacobian[rows:].mul_(_ROTATION_LENGTH)
         return Equations(columns, q, jacobian, error, size.mul(0.5 * _DAMPING).add_(_LEAST_DAMPING))
 
-    def _step(
-        self, batch: _Batch, equations: Equations, done: Tensor | None = None
-    ) -> list[tuple[Equations, Tensor]]:
+    def _step(self, batch: _Batch, equations: Equations, done: Tensor | None = None) -> list[tuple[Equations, Tensor]]:
         """Moves columns, but those that are done, as far as limits allow.
 
         Gives those of which a joint was stopped at a limit, and where they would have gone.

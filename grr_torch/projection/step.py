@@ -35,10 +35,12 @@ class Equations(NamedTuple):
     damping: Tensor
 
     def take(self, which: Tensor | slice) -> Equations:
+        """Some of them."""
         return Equations(*(tensor[..., which] for tensor in self))
 
     @classmethod
     def join(cls, parts: Sequence[Equations]) -> Equations:
+        """All parts side by side."""
         return parts[0] if len(parts) == 1 else cls(*(torch.cat(tensors, -1) for tensors in zip(*parts, strict=True)))
 
 

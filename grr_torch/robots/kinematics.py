@@ -85,16 +85,16 @@ class KinematicTree:
         """
         width, count = q.shape[1], len(self.joints)
         values = self._joint_values(q, self._joint_matrices[3][:count])
-        cosines, sines = values.cos().unbind(0), values.sin()
-        sines = torch.stack([sines, -sines], 1)[:, :, None].unbind(0)
+        cosines, sine = values.cos().unbind(0), values.sin()
+        sines = torch.stack([sine, -sine], 1)[:, :, None].unbind(0)
         frames = workspace[: 12 * (count + 2) * width].view(count + 2, 4, 3, width)
         frames[-1] = torch.eye(4, 3, dtype=q.dtype, device=q.device)[:, :, None]
         whole, turned = frames.view(count + 2, 4, -1).unbind(0), frames[:, :2].unbind(0)
         # rows z, origin, x, y, x at value zero, the first two in their place
         size = 3 * width
-        at_zero = frames.as_strided((count, 5, size), (4 * size, size, 1), frames.storage_offset() + 2 * size)
-        xy, yx = (at_zero[:, k : k + 2].view(count, 2, 3, width).unbind(0) for k in (2, 3))
-        at_zero = at_zero.unbind(0)
+        mounted = frames.as_strided((count, 5, size), (4 * size, size, 1), frames.storage_offset() + 2 * size)
+        xy, yx = (mounted[:, k : k + 2].view(count, 2, 3, width).unbind(0) for k in (2, 3))
+        at_zero = mounted.unbind(0)
         for index, (joint, mount) in enumerate(zip(self.joints, self._turning_mounts, strict=True)):
             torch.mm(mount, whole[joint.parent], out=at_zero[index])
             if joint.revolute:

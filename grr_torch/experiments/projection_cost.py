@@ -1,0 +1,262 @@
+"""What a projection is made of, and what would be left of it if only its arithmetic cost time."""
+
+from __future__ import annotations
+
+import cProfile
+import math
+import pstats
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from types import FrameType
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from grr_torch.experiments.timing import median_seconds
+from grr_torch.pieces import one_thread, slices
+from grr_torch.projection.project import project_columns
+from grr_torch.projection.step import Equations, free_step, stop_at_limits
+from grr_torch.robots.kinematics import KinematicTree
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.rotation import rotation_error
+from grr_torch.spaces.task import Position
+
+# how far from a solution the projection starts, in every joint [rad]
+_PERTURBATION = 0.3
+# columns of a call that is all overhead; fewer are computed in another way
+_NARROW = 32
+# operators that only make memory, or give its shape
+_NO_ARITHMETIC = ("empty", "new_empty", "empty_like", "detach", "_local_scalar_dense")
+
+
+class AnyPose(Position):
+    """Poses as columns of position and rotation matrix."""
+
+    @property
+    def width(self) -> int:
+        """Three coordinates and nine entries."""
+        return 12
+
+    @property
+    def constraints(self) -> int:
+        """All six."""
+        return 6
+
+    def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
+        """Rotation vectors (3, N) [rad]."""
+        return rotation_error(targets[3:].view(3, 3, -1), rotation)
+
+
+@dataclass(frozen=True)
+class PoseProblem:
+    """Poses of random configurations, to be projected to from configurations nearby.
+
+    Attributes:
+        robot: The robot.
+        position: (N, 3).
+        rotation: (N, 3, 3).
+        guesses: (N, n).
+    """
+
+    robot: Robot
+    position: Tensor
+    rotation: Tensor
+    guesses: Tensor
+
+    @classmethod
+    def sample(cls, robot: Robot, count: int) -> PoseProblem:
+        """Starts are up to 0.3 rad from the configurations that the poses are of, in every joint."""
+        q = robot.sample(count, torch.Generator().manual_seed(0))
+        noise = torch.rand(count, robot.n, dtype=q.dtype, generator=torch.Generator().manual_seed(1)).to(q)
+        guesses = (q + _PERTURBATION * (2.0 * noise - 1.0)).clamp(robot.lower, robot.upper)
+        return cls(robot, *robot.forward_kinematics(q), guesses)
+
+    def columns(self) -> tuple[Tensor, Tensor]:
+        """Targets (12, N) of `AnyPose` and guesses (n, N)."""
+        targets = torch.cat([self.position, self.rotation.reshape(-1, 9)], dim=1).T.contiguous()
+        return targets, self.robot.columns(self.guesses)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One kernel's share of a projection.
+
+    Attributes:
+        name: What it does.
+        columns: How often it is done a pose.
+        calls: How often it is called, for all poses together.
+        seconds: Time a pose.
+        waiting: Of it, what would be left if the calls had next to no columns: the cost of torch calls.
+        operators: Torch operators a call.
+        flops: Floating-point operations a column.
+    """
+
+    name: str
+    columns: float
+    calls: float
+    seconds: float
+    waiting: float = math.nan
+    operators: int = 0
+    flops: float = 0.0
+
+
+@dataclass(frozen=True)
+class ProjectionCost:
+    """What a projection is made of.
+
+    Attributes:
+        seconds: Time a pose, without the profiler.
+        parts: Its shares; with the profiler they add up to a little more.
+        functions: Time a pose of sines and cosines alone, which is in the first part.
+        flops_per_second: Of fused multiply-adds of torch on operands in the cache.
+    """
+
+    seconds: float
+    parts: list[Part]
+    functions: float
+    flops_per_second: float
+
+    def without_calls(self) -> float:
+        """Time a pose of the iterations' kernels if a torch call cost nothing."""
+        return sum(part.seconds - part.waiting for part in self.parts if part.flops)
+
+    def floor(self) -> float:
+        """Time a pose of those kernels' arithmetic at `flops_per_second`, and of the sines and cosines."""
+        return self.functions + sum(part.columns * part.flops for part in self.parts) / self.flops_per_second
+
+
+# each kernel, and the argument whose last axis counts its columns
+_KERNELS: dict[str, tuple[Callable[..., Any], str]] = {
+    "poses of the frames": (KinematicTree.frames, "q"),
+    "errors": (AnyPose.error, "targets"),
+    "Jacobians": (KinematicTree.jacobian, "frames"),
+    "steps: damped least squares": (free_step, "equations"),
+    "steps again, at limits": (stop_at_limits, "moved"),
+}
+
+
+def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> ProjectionCost:
+    """Runs a projection of random poses and takes it apart.
+
+    Args:
+        robot: The robot, on the CPU.
+        count: How many poses.
+        repeats: Over how many runs figures are averaged.
+    """
+    targets, q = PoseProblem.sample(robot, count).columns()
+    task = AnyPose(3)
+
+    def run() -> None:
+        project_columns(robot, task, targets, q, check_collision=False)
+
+    whole = median_seconds({"": run}, repeats)[""] / count
+    widths, seconds = _widths(run), _seconds(run, repeats)
+    with torch.no_grad(), one_thread():
+        width = slices(count, q.device)[0].stop
+        wide, narrow = (_calls(robot, task, targets[:, :size], q[:, :size]) for size in (width, min(_NARROW, width)))
+        counters = {name: count_operators(call) for name, call in wide.items()}
+        unit = torch.ones(2, 6, width, dtype=q.dtype)
+        basic = {
+            "add": lambda: unit[0].addcmul_(unit[1], unit[1]),
+            "functions": lambda: (q[:, :width].cos(), q[:, :width].sin()),
+        }
+        medians = median_seconds({**narrow, **basic}, repeats)
+    parts = []
+    for name in _KERNELS:
+        part = Part(name, sum(widths[name]) / count, len(widths[name]), seconds[name] / count)
+        if name in counters:
+            part = replace(
+                part,
+                waiting=part.calls * medians[name] / count,
+                operators=counters[name].operators,
+                flops=counters[name].flops / width,
+            )
+        parts.append(part)
+    rest = seconds[""] / count - sum(part.seconds for part in parts)
+    return ProjectionCost(
+        seconds=whole,
+        parts=[*parts, Part("checks, clamping, bookkeeping", 1.0, 1, rest)],
+        functions=parts[0].columns * medians["functions"] / width,
+        flops_per_second=2.0 * unit[0].numel() / medians["add"],
+    )
+
+
+def _widths(run: Callable[[], None]) -> dict[str, list[int]]:
+    """Columns of every call of each kernel in a run."""
+    kernels = {function.__code__: (name, argument) for name, (function, argument) in _KERNELS.items()}
+    widths: dict[str, list[int]] = {name: [] for name in _KERNELS}
+
+    def note(frame: FrameType, event: str, _: Any) -> None:
+        if event == "call" and frame.f_code in kernels:
+            name, argument = kernels[frame.f_code]
+            value = frame.f_locals[argument]
+            widths[name].append((value.q if isinstance(value, Equations) else value).shape[-1])
+
+    before = sys.getprofile()
+    sys.setprofile(note)
+    try:
+        run()
+    finally:
+        sys.setprofile(before)
+    return widths
+
+
+def _seconds(run: Callable[[], None], repeats: int) -> dict[str, float]:
+    """Mean time of a run in each kernel, what it calls included; and under "", of the whole run."""
+    profiler = cProfile.Profile(time.process_time, builtins=False)
+    for _ in range(repeats):
+        profiler.runcall(run)
+    found = pstats.Stats(profiler).stats  # type: ignore[attr-defined]
+    codes = {name: function.__code__ for name, (function, _) in _KERNELS.items()} | {"": run.__code__}
+    keys = {name: (code.co_filename, code.co_firstlineno, code.co_name) for name, code in codes.items()}
+    return {name: found[key][3] / repeats if key in found else 0.0 for name, key in keys.items()}
+
+
+def _calls(robot: Robot, task: AnyPose, targets: Tensor, q: Tensor) -> dict[str, Callable[[], Any]]:
+    """The kernels of one iteration by themselves, on the columns that are given."""
+    tree, workspace = robot.tree, robot.tree.workspace(q, q.shape[1])
+    frames = tree.frames(q, workspace)
+    pose, jacobian = tree.tool_pose(frames), tree.jacobian(frames)
+    error = task.error(targets, *pose)
+    every = torch.arange(q.shape[1])
+    equations = Equations(every, q, task.jacobian(jacobian), error, torch.full_like(q[0], 1e-3))
+    return {
+        "poses of the frames": lambda: tree.frames(q, workspace),
+        "errors": lambda: task.error(targets, *pose),
+        "Jacobians": lambda: tree.jacobian(frames),
+        "steps: damped least squares": lambda: free_step(equations),
+    }
+
+
+class OperatorCounter(TorchDispatchMode):
+    """Counts torch operators that compute, and their floating-point operations."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.operators = 0
+        self.flops = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        name = func.overloadpacket.__name__.rstrip("_")
+        if func.is_view or name in _NO_ARITHMETIC:
+            return result
+        self.operators += 1
+        if name == "mm":
+            self.flops += 2 * args[0].shape[0] * args[1].numel()
+        elif name in ("sum", "amax"):
+            self.flops += args[0].numel()
+        elif name not in ("copy", "stack", "cat"):
+            self.flops += (2 if name == "addcmul" else 1) * result.numel()
+        return result
+
+
+def count_operators(call: Callable[[], Any]) -> OperatorCounter:
+    """Runs a call and counts."""
+    with OperatorCounter() as counter:
+        call()
+    return counter
