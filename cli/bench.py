@@ -187,7 +187,7 @@ def _show_projection_cost(robot: Robot) -> None:
 
     cost = projection_cost(robot)
     head = ["projection of 10,000 poses from ±0.3 rad", "times a pose", "calls", "µs each", "µs a pose"]
-    head += ["of it cost of torch calls", "operators a call", "floating-point operations each"]
+    head += ["of it cost of torch calls", "operators a call", "operations each in products", "in others"]
     rows = [
         [
             part.name,
@@ -195,17 +195,20 @@ def _show_projection_cost(robot: Robot) -> None:
             f"{part.calls:.0f}",
             f"{1e6 * part.seconds / part.columns:.3f}" if part.columns else "",
             f"{1e6 * part.seconds:.3f}",
-            f"{1e6 * part.waiting:.3f}" if part.flops else "",
-            f"{part.operators}" if part.flops else "",
-            f"{part.flops:.0f}" if part.flops else "",
+            *(
+                (f"{1e6 * part.waiting:.3f}", f"{part.operators}", f"{part.products:.0f}", f"{part.pointwise:.0f}")
+                if part.operators
+                else [""] * 4
+            ),
         ]
         for part in cost.parts
     ]
     typer.echo(markdown_table(head, rows))
     for what, seconds in {
-        "all of it, without the profiler, on one thread": cost.seconds,
+        "all of it, without the profiler, CPU time on one thread": cost.seconds,
         "the first four rows, if a torch call cost nothing": cost.without_calls(),
-        f"their operations at the {cost.flops_per_second / 1e9:.1f} GFLOP/s of torch.addcmul on operands in the cache, "
-        f"and {1e6 * cost.functions:.2f} µs of sines and cosines: the floor": cost.floor(),
+        f"the floor: their operations at the {cost.product_rate / 1e9:.1f} GFLOP/s of torch.mm and the "
+        f"{cost.pointwise_rate / 1e9:.1f} of torch.addcmul on operands in the cache, and {1e6 * cost.functions:.2f} µs "
+        f"of sines and cosines": cost.floor(),
     }.items():
         typer.echo(f"\n{1e6 * seconds:.2f} µs a pose, {1.0 / seconds:,.0f} poses / s: {what}")

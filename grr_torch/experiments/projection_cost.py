@@ -5,6 +5,7 @@ from __future__ import annotations
 import cProfile
 import math
 import pstats
+import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -92,7 +93,8 @@ class Part:
         seconds: Time a pose.
         waiting: Of it, what would be left if the calls had next to no columns: the cost of torch calls.
         operators: Torch operators a call.
-        flops: Floating-point operations a column.
+        products: Floating-point operations a column in products of matrices.
+        pointwise: And in all other operators.
     """
 
     name: str
@@ -101,7 +103,8 @@ class Part:
     seconds: float
     waiting: float = math.nan
     operators: int = 0
-    flops: float = 0.0
+    products: float = 0.0
+    pointwise: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -109,24 +112,28 @@ class ProjectionCost:
     """What a projection is made of.
 
     Attributes:
-        seconds: Time a pose, without the profiler.
+        seconds: CPU time a pose [s], without the profiler.
         parts: Its shares; with the profiler they add up to a little more.
         functions: Time a pose of sines and cosines alone, which is in the first part.
-        flops_per_second: Of fused multiply-adds of torch on operands in the cache.
+        product_rate: Floating-point operations a second of torch.mm, of the size that poses need.
+        pointwise_rate: And of torch.addcmul on operands in the cache.
     """
 
     seconds: float
     parts: list[Part]
     functions: float
-    flops_per_second: float
+    product_rate: float
+    pointwise_rate: float
 
     def without_calls(self) -> float:
         """Time a pose of the iterations' kernels if a torch call cost nothing."""
-        return sum(part.seconds - part.waiting for part in self.parts if part.flops)
+        return sum(part.seconds - part.waiting for part in self.parts if part.operators)
 
     def floor(self) -> float:
-        """Time a pose of those kernels' arithmetic at `flops_per_second`, and of the sines and cosines."""
-        return self.functions + sum(part.columns * part.flops for part in self.parts) / self.flops_per_second
+        """Time a pose of those kernels' arithmetic at these rates, and of the sines and cosines."""
+        products = sum(part.columns * part.products for part in self.parts) / self.product_rate
+        pointwise = sum(part.columns * part.pointwise for part in self.parts) / self.pointwise_rate
+        return products + pointwise + self.functions
 
 
 # each kernel, and the argument whose last axis counts its columns
@@ -145,7 +152,7 @@ def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> Proj
     Args:
         robot: The robot, on the CPU.
         count: How many poses.
-        repeats: Over how many runs figures are averaged.
+        repeats: Medians are taken over so many runs.
     """
     targets, q = PoseProblem.sample(robot, count).columns()
     task = AnyPose(3)
@@ -153,35 +160,35 @@ def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> Proj
     def run() -> None:
         project_columns(robot, task, targets, q, check_collision=False)
 
-    whole = median_seconds({"": run}, repeats)[""] / count
     widths, seconds = _widths(run), _seconds(run, repeats)
     with torch.no_grad(), one_thread():
         width = slices(count, q.device)[0].stop
         wide, narrow = (_calls(robot, task, targets[:, :size], q[:, :size]) for size in (width, min(_NARROW, width)))
         counters = {name: count_operators(call) for name, call in wide.items()}
-        unit = torch.ones(2, 6, width, dtype=q.dtype)
+        one, two = torch.ones(2, 6, width, dtype=q.dtype)
+        left, right, out = (torch.ones(size, dtype=q.dtype) for size in ((5, 4), (4, 3 * width), (5, 3 * width)))
         basic = {
-            "add": lambda: unit[0].addcmul_(unit[1], unit[1]),
+            "whole": run,
             "functions": lambda: (q[:, :width].cos(), q[:, :width].sin()),
+            "mm": lambda: torch.mm(left, right, out=out),
+            "addcmul": lambda: one.addcmul_(two, two),
         }
-        medians = median_seconds({**narrow, **basic}, repeats)
-    parts = []
-    for name in _KERNELS:
-        part = Part(name, sum(widths[name]) / count, len(widths[name]), seconds[name] / count)
-        if name in counters:
-            part = replace(
-                part,
-                waiting=part.calls * medians[name] / count,
-                operators=counters[name].operators,
-                flops=counters[name].flops / width,
-            )
-        parts.append(part)
+        medians = median_seconds({**narrow, **basic}, repeats, time.process_time)
+    parts = [Part(name, sum(widths[name]) / count, len(widths[name]), seconds[name] / count) for name in _KERNELS]
     rest = seconds[""] / count - sum(part.seconds for part in parts)
+    for index, part in enumerate(parts):
+        if part.name in counters:
+            counter, waiting = counters[part.name], part.calls * medians[part.name] / count
+            products, pointwise = counter.products / width, counter.pointwise / width
+            parts[index] = replace(
+                part, waiting=waiting, operators=counter.operators, products=products, pointwise=pointwise
+            )
     return ProjectionCost(
-        seconds=whole,
+        seconds=medians["whole"] / count,
         parts=[*parts, Part("checks, clamping, bookkeeping", 1.0, 1, rest)],
         functions=parts[0].columns * medians["functions"] / width,
-        flops_per_second=2.0 * unit[0].numel() / medians["add"],
+        product_rate=2.0 * 4 * out.numel() / medians["mm"],
+        pointwise_rate=2.0 * one.numel() / medians["addcmul"],
     )
 
 
@@ -206,14 +213,17 @@ def _widths(run: Callable[[], None]) -> dict[str, list[int]]:
 
 
 def _seconds(run: Callable[[], None], repeats: int) -> dict[str, float]:
-    """Mean time of a run in each kernel, what it calls included; and under "", of the whole run."""
-    profiler = cProfile.Profile(time.process_time, builtins=False)
-    for _ in range(repeats):
-        profiler.runcall(run)
-    found = pstats.Stats(profiler).stats  # type: ignore[attr-defined]
+    """Median CPU time of a run in each kernel, what it calls included; and under "", of the whole run."""
     codes = {name: function.__code__ for name, (function, _) in _KERNELS.items()} | {"": run.__code__}
-    keys = {name: (code.co_filename, code.co_firstlineno, code.co_name) for name, code in codes.items()}
-    return {name: found[key][3] / repeats if key in found else 0.0 for name, key in keys.items()}
+    times: dict[str, list[float]] = {name: [] for name in codes}
+    for _ in range(repeats):
+        profiler = cProfile.Profile(time.process_time, builtins=False)
+        profiler.runcall(run)
+        found = pstats.Stats(profiler).stats  # type: ignore[attr-defined]
+        for name, code in codes.items():
+            key = (code.co_filename, code.co_firstlineno, code.co_name)
+            times[name].append(found[key][3] if key in found else 0.0)
+    return {name: statistics.median(values) for name, values in times.items()}
 
 
 def _calls(robot: Robot, task: AnyPose, targets: Tensor, q: Tensor) -> dict[str, Callable[[], Any]]:
@@ -238,7 +248,8 @@ class OperatorCounter(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self.operators = 0
-        self.flops = 0
+        self.products = 0
+        self.pointwise = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
@@ -247,11 +258,11 @@ class OperatorCounter(TorchDispatchMode):
             return result
         self.operators += 1
         if name == "mm":
-            self.flops += 2 * args[0].shape[0] * args[1].numel()
+            self.products += 2 * args[0].shape[0] * args[1].numel()
         elif name in ("sum", "amax"):
-            self.flops += args[0].numel()
+            self.pointwise += args[0].numel()
         elif name not in ("copy", "stack", "cat"):
-            self.flops += (2 if name == "addcmul" else 1) * result.numel()
+            self.pointwise += (2 if name == "addcmul" else 1) * result.numel()
         return result
 
 
