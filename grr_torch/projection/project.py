@@ -204,11 +204,13 @@ class _Projection:
             if len(left) < _LEFT * len(size):
                 few.append(self._equations(*(tensor.index_select(-1, left) for tensor in ahead)))
             else:
-                beyond += self._step(batch, self._equations(*ahead), done[part] if len(left) < len(size) else None)
+                there = done[part] if len(left) < len(size) else None
+                batch.q[:, part] = self._step(self._equations(*ahead), beyond, there)
         if few:
             together = Equations.join(few)
             for part in slices(len(together.columns), every.device):
-                beyond += self._step(batch, together.take(part))
+                equations = together.take(part)
+                batch.q.index_copy_(1, equations.columns, self._step(equations, beyond))
         if self.limits is not None and beyond:
             together, moved = Equations.join([e for e, _ in beyond]), torch.cat([m for _, m in beyond], -1)
             batch.q.index_copy_(1, together.columns, stop_at_limits(self.limits, together, moved))
@@ -236,21 +238,17 @@ class _Projection:
             jacobian[rows:].mul_(_ROTATION_LENGTH)
         return Equations(columns, q, jacobian, error, size.mul(0.5 * _DAMPING).add_(_LEAST_DAMPING))
 
-    def _step(self, batch: _Batch, equations: Equations, done: Tensor | None = None) -> list[tuple[Equations, Tensor]]:
-        """Moves columns, but those that are done, as far as limits allow.
+    def _step(self, equations: Equations, beyond: list[tuple[Equations, Tensor]], done: Tensor | None = None) -> Tensor:
+        """Configurations (n, M) after a step, clamped; those that are done stay.
 
-        Gives those of which a joint was stopped at a limit, and where they would have gone.
+        Appends to `beyond` those of which a joint was stopped at a limit, and where they would have gone.
         """
         moved = free_step(equations)
-        if self.limits is None:
-            batch.q.index_copy_(1, equations.columns, moved if done is None else torch.where(done, equations.q, moved))
-            return []
-        kept = moved.clamp(*self.limits)
-        stopped = (kept != moved).any(0)
-        if done is not None:
-            kept = torch.where(done, equations.q, kept)
-            stopped &= ~done
-        which = stopped.nonzero()[:, 0]
-        beyond = [(equations.take(which), moved.index_select(1, which))] if len(which) else []
-        batch.q.index_copy_(1, equations.columns, kept)
-        return beyond
+        kept = moved if self.limits is None else moved.clamp(*self.limits)
+        if self.limits is not None:
+            # of bytes, the largest is found faster than whether any is true
+            stopped = (kept != moved).view(torch.uint8).amax(0)
+            which = (stopped if done is None else stopped * ~done).nonzero()[:, 0]
+            if len(which):
+                beyond.append((equations.take(which), moved.index_select(1, which)))
+        return kept if done is None else torch.where(done, equations.q, kept)
