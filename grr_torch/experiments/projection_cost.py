@@ -168,14 +168,13 @@ def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> Proj
         one, two = torch.ones(2, 6, width, dtype=q.dtype)
         left, right, out = (torch.ones(size, dtype=q.dtype) for size in ((5, 4), (4, 3 * width), (5, 3 * width)))
         basic = {
-            "whole": run,
             "functions": lambda: (q[:, :width].cos(), q[:, :width].sin()),
             "mm": lambda: torch.mm(left, right, out=out),
             "addcmul": lambda: one.addcmul_(two, two),
         }
         medians = median_seconds({**narrow, **basic}, repeats, time.process_time)
     parts = [Part(name, sum(widths[name]) / count, len(widths[name]), seconds[name] / count) for name in _KERNELS]
-    rest = seconds[""] / count - sum(part.seconds for part in parts)
+    rest = seconds["profiled"] / count - sum(part.seconds for part in parts)
     for index, part in enumerate(parts):
         if part.name in counters:
             counter, waiting = counters[part.name], part.calls * medians[part.name] / count
@@ -184,7 +183,7 @@ def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> Proj
                 part, waiting=waiting, operators=counter.operators, products=products, pointwise=pointwise
             )
     return ProjectionCost(
-        seconds=medians["whole"] / count,
+        seconds=seconds["plain"] / count,
         parts=[*parts, Part("checks, clamping, bookkeeping", 1.0, 1, rest)],
         functions=parts[0].columns * medians["functions"] / width,
         product_rate=2.0 * 4 * out.numel() / medians["mm"],
@@ -213,9 +212,9 @@ def _widths(run: Callable[[], None]) -> dict[str, list[int]]:
 
 
 def _seconds(run: Callable[[], None], repeats: int) -> dict[str, float]:
-    """Median CPU time of a run in each kernel, what it calls included; and under "", of the whole run."""
-    codes = {name: function.__code__ for name, (function, _) in _KERNELS.items()} | {"": run.__code__}
-    times: dict[str, list[float]] = {name: [] for name in codes}
+    """Median CPU time of a run in each kernel, what it calls included; and of the whole run, profiled and plain."""
+    codes = {name: function.__code__ for name, (function, _) in _KERNELS.items()} | {"profiled": run.__code__}
+    times: dict[str, list[float]] = {name: [] for name in [*codes, "plain"]}
     for _ in range(repeats):
         profiler = cProfile.Profile(time.process_time, builtins=False)
         profiler.runcall(run)
@@ -223,6 +222,9 @@ def _seconds(run: Callable[[], None], repeats: int) -> dict[str, float]:
         for name, code in codes.items():
             key = (code.co_filename, code.co_firstlineno, code.co_name)
             times[name].append(found[key][3] if key in found else 0.0)
+        begin = time.process_time()
+        run()
+        times["plain"].append(time.process_time() - begin)
     return {name: statistics.median(values) for name, values in times.items()}
 
 
