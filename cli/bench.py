@@ -205,7 +205,7 @@ def _show_projection_cost(robot: Robot) -> None:
     ]
     typer.echo(markdown_table(head, rows))
     for what, seconds in {
-        "all of it, without the profiler, CPU time on one thread": cost.seconds,
+        "all of it, CPU time on one thread": cost.seconds,
         "the first four rows, if a torch call cost nothing": cost.without_calls(),
         f"the floor: their operations at the {cost.product_rate / 1e9:.1f} GFLOP/s of torch.mm and the "
         f"{cost.pointwise_rate / 1e9:.1f} of torch.addcmul on operands in the cache, and {1e6 * cost.functions:.2f} µs "

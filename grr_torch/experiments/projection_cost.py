@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import cProfile
 import math
-import pstats
 import statistics
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -17,7 +16,6 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from grr_torch.experiments.timing import median_seconds
 from grr_torch.pieces import one_thread, slices
 from grr_torch.projection.project import project_columns
 from grr_torch.projection.step import Equations, free_step, stop_at_limits
@@ -112,8 +110,8 @@ class ProjectionCost:
     """What a projection is made of.
 
     Attributes:
-        seconds: CPU time a pose [s], without the profiler.
-        parts: Its shares; with the profiler they add up to a little more.
+        seconds: CPU time a pose [s].
+        parts: Its shares; those of kernels are of their calls done again, with operands in the cache.
         functions: Time a pose of sines and cosines alone, which is in the first part.
         product_rate: Floating-point operations a second of torch.mm, of the size that poses need.
         pointwise_rate: And of torch.addcmul on operands in the cache.
@@ -147,7 +145,7 @@ _KERNELS: dict[str, tuple[Callable[..., Any], str]] = {
 
 
 def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> ProjectionCost:
-    """Runs a projection of random poses and takes it apart.
+    """Runs a projection of random poses, and every call of its kernels once more by itself.
 
     Args:
         robot: The robot, on the CPU.
@@ -160,47 +158,58 @@ def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> Proj
     def run() -> None:
         project_columns(robot, task, targets, q, check_collision=False)
 
-    widths, seconds = _widths(run), _seconds(run, repeats)
+    whole = _cpu_seconds(run, repeats) / count
+    calls = _record(run)
     with torch.no_grad(), one_thread():
         width = slices(count, q.device)[0].stop
         wide, narrow = (_calls(robot, task, targets[:, :size], q[:, :size]) for size in (width, min(_NARROW, width)))
-        counters = {name: count_operators(call) for name, call in wide.items()}
         one, two = torch.ones(2, 6, width, dtype=q.dtype)
         left, right, out = (torch.ones(size, dtype=q.dtype) for size in ((5, 4), (4, 3 * width), (5, 3 * width)))
-        basic = {
-            "functions": lambda: (q[:, :width].cos(), q[:, :width].sin()),
-            "mm": lambda: torch.mm(left, right, out=out),
-            "addcmul": lambda: one.addcmul_(two, two),
-        }
-        medians = median_seconds({**narrow, **basic}, repeats, time.process_time)
-    parts = [Part(name, sum(widths[name]) / count, len(widths[name]), seconds[name] / count) for name in _KERNELS]
-    rest = seconds["profiled"] / count - sum(part.seconds for part in parts)
-    for index, part in enumerate(parts):
-        if part.name in counters:
-            counter, waiting = counters[part.name], part.calls * medians[part.name] / count
-            products, pointwise = counter.products / width, counter.pointwise / width
-            parts[index] = replace(
-                part, waiting=waiting, operators=counter.operators, products=products, pointwise=pointwise
-            )
+        parts = []
+        for name in _KERNELS:
+            seconds = sum(_cpu_seconds(call, repeats) for _, call in calls[name])
+            part = Part(name, sum(size for size, _ in calls[name]) / count, len(calls[name]), seconds / count)
+            if name in wide:
+                counter, waiting = count_operators(wide[name]), _cpu_seconds(narrow[name], repeats)
+                part = replace(
+                    part,
+                    waiting=part.calls * waiting / count,
+                    operators=counter.operators,
+                    products=counter.products / width,
+                    pointwise=counter.pointwise / width,
+                )
+            parts.append(part)
+        functions = _cpu_seconds(lambda: (q[:, :width].cos(), q[:, :width].sin()), repeats)
+        product = _cpu_seconds(lambda: torch.mm(left, right, out=out), repeats)
+        pointwise = _cpu_seconds(lambda: one.addcmul_(two, two), repeats)
+    rest = Part(
+        "the rest: checks, bookkeeping, operands no longer in the cache",
+        1.0,
+        1,
+        whole - sum(part.seconds for part in parts),
+    )
     return ProjectionCost(
-        seconds=seconds["plain"] / count,
-        parts=[*parts, Part("checks, clamping, bookkeeping", 1.0, 1, rest)],
-        functions=parts[0].columns * medians["functions"] / width,
-        product_rate=2.0 * 4 * out.numel() / medians["mm"],
-        pointwise_rate=2.0 * one.numel() / medians["addcmul"],
+        seconds=whole,
+        parts=[*parts, rest],
+        functions=parts[0].columns * functions / width,
+        product_rate=2.0 * 4 * out.numel() / product,
+        pointwise_rate=2.0 * one.numel() / pointwise,
     )
 
 
-def _widths(run: Callable[[], None]) -> dict[str, list[int]]:
-    """Columns of every call of each kernel in a run."""
-    kernels = {function.__code__: (name, argument) for name, (function, argument) in _KERNELS.items()}
-    widths: dict[str, list[int]] = {name: [] for name in _KERNELS}
+def _record(run: Callable[[], None]) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
+    """Every call of each kernel in a run: how many columns it had, and how to do it again."""
+    kernels = {function.__code__: (name, function, argument) for name, (function, argument) in _KERNELS.items()}
+    calls: dict[str, list[tuple[int, Callable[[], Any]]]] = {name: [] for name in _KERNELS}
 
     def note(frame: FrameType, event: str, _: Any) -> None:
-        if event == "call" and frame.f_code in kernels:
-            name, argument = kernels[frame.f_code]
+        code = frame.f_code
+        if event == "call" and code in kernels:
+            name, function, argument = kernels[code]
+            values = [_copy(frame.f_locals[variable]) for variable in code.co_varnames[: code.co_argcount]]
             value = frame.f_locals[argument]
-            widths[name].append((value.q if isinstance(value, Equations) else value).shape[-1])
+            width = (value.q if isinstance(value, Equations) else value).shape[-1]
+            calls[name].append((width, partial(function, *values)))
 
     before = sys.getprofile()
     sys.setprofile(note)
@@ -208,24 +217,25 @@ def _widths(run: Callable[[], None]) -> dict[str, list[int]]:
         run()
     finally:
         sys.setprofile(before)
-    return widths
+    return calls
 
 
-def _seconds(run: Callable[[], None], repeats: int) -> dict[str, float]:
-    """Median CPU time of a run in each kernel, what it calls included; and of the whole run, profiled and plain."""
-    codes = {name: function.__code__ for name, (function, _) in _KERNELS.items()} | {"profiled": run.__code__}
-    times: dict[str, list[float]] = {name: [] for name in [*codes, "plain"]}
+def _copy(value: Any) -> Any:
+    """An argument as it is now: what a kernel is given may be overwritten."""
+    if isinstance(value, Equations):
+        return Equations(*(tensor.clone() for tensor in value))
+    return value.clone() if isinstance(value, Tensor) else value
+
+
+def _cpu_seconds(call: Callable[[], Any], repeats: int) -> float:
+    """Median CPU time of a call [s], after one that fills the cache."""
+    call()
+    times = []
     for _ in range(repeats):
-        profiler = cProfile.Profile(time.process_time, builtins=False)
-        profiler.runcall(run)
-        found = pstats.Stats(profiler).stats  # type: ignore[attr-defined]
-        for name, code in codes.items():
-            key = (code.co_filename, code.co_firstlineno, code.co_name)
-            times[name].append(found[key][3] if key in found else 0.0)
         begin = time.process_time()
-        run()
-        times["plain"].append(time.process_time() - begin)
-    return {name: statistics.median(values) for name, values in times.items()}
+        call()
+        times.append(time.process_time() - begin)
+    return statistics.median(times)
 
 
 def _calls(robot: Robot, task: AnyPose, targets: Tensor, q: Tensor) -> dict[str, Callable[[], Any]]:

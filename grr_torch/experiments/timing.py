@@ -24,10 +24,8 @@ from grr_torch.version import __version__
 _SHORTEST = 0.1
 
 
-def median_seconds(
-    calls: Mapping[str, Callable[[], Any]], repeats: int, clock: Callable[[], float] = time.perf_counter
-) -> dict[str, float]:
-    """Median time of each call [s], by a clock. They run by turns; each ran once before."""
+def median_seconds(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Median time of each call [s]. They run by turns; each ran once before."""
     for call in calls.values():
         call()
     loops = {name: _loops(call) for name, call in calls.items()}
@@ -37,10 +35,10 @@ def median_seconds(
     try:
         for _ in range(repeats):
             for name, call in calls.items():
-                begin = clock()
+                begin = time.perf_counter()
                 for _ in range(loops[name]):
                     call()
-                times[name].append((clock() - begin) / loops[name])
+                times[name].append((time.perf_counter() - begin) / loops[name])
     finally:
         gc.enable()
     return {name: statistics.median(values) for name, values in times.items()}
