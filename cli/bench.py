@@ -12,6 +12,7 @@ from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 if TYPE_CHECKING:
     from grr_torch.experiments.roadmaps import Result
     from grr_torch.experiments.speed import Row, SpeedTable
+    from grr_torch.robots.robot import Robot
 
 app = typer.Typer(name="bench", help="Measure: the tables of the README.", no_args_is_help=True)
 
@@ -35,7 +36,8 @@ def speed(
     threads: Annotated[int | None, typer.Option(min=1, help="For torch; by default what torch takes.")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
     profile: Annotated[
-        bool, typer.Option("--profile", help="Where a build's time goes, instead of the table.")
+        bool,
+        typer.Option("--profile", help="Where the time of builds and of the projection goes, instead of the table."),
     ] = False,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
 ) -> None:
@@ -154,13 +156,59 @@ def _figure(value: float) -> str:
 
 def _show_profile(device: str) -> None:
     from grr_torch.experiments.profile import profile_build
+    from grr_torch.experiments.speed import GROWTH
     from grr_torch.robots.load import load_robot
 
-    columns: dict[str, list[float]] = {}
-    problems = [(robot, task) for robot in ("planar_5", "kinova") for task in ("position", "fixed-rotation")]
-    for robot, task in problems:
-        for stage in profile_build(load_robot(robot, device=device), task):
-            columns.setdefault(stage.name, []).append(1e3 * stage.seconds)
-    rows = [[name, *(f"{value:.1f}" for value in values)] for name, values in columns.items()]
-    rows.append(["sum", *(f"{sum(values):.1f}" for values in zip(*columns.values(), strict=True))])
-    typer.echo(markdown_table(["own time, ms", *(f"{robot} {task}" for robot, task in problems)], rows))
+    kinova = load_robot("kinova", device=device)
+    builds, growth = {}, {}
+    for name in ("planar_5", "kinova"):
+        robot = kinova if name == "kinova" else load_robot(name, device=device)
+        for task in ("position", "fixed-rotation"):
+            stages, _ = profile_build(robot, task)
+            builds[f"{name} {task}"] = {stage.name: 1e3 * stage.seconds for stage in stages}
+    for points in GROWTH:
+        stages, vertices = profile_build(kinova, "position", points)
+        growth[f"{vertices:,} vertices"] = {stage.name: 1e6 * stage.seconds / vertices for stage in stages}
+    _show_stages("build, own time, ms", builds)
+    _show_stages("build, kinova position, µs a vertex", growth)
+    if kinova.device.type == "cpu":
+        _show_projection_cost(kinova)
+
+
+def _show_stages(what: str, columns: dict[str, dict[str, float]]) -> None:
+    values = list(columns.values())
+    rows = [[stage, *(f"{column[stage]:.2f}" for column in values)] for stage in values[0]]
+    rows.append(["sum", *(f"{sum(column.values()):.2f}" for column in values)])
+    typer.echo(markdown_table([what, *columns], rows) + "\n")
+
+
+def _show_projection_cost(robot: Robot) -> None:
+    from grr_torch.experiments.projection_cost import projection_cost
+
+    cost = projection_cost(robot)
+    head = ["projection of 10,000 poses from ±0.3 rad", "times a pose", "calls", "µs each", "µs a pose"]
+    head += ["of it cost of torch calls", "operators a call", "operations each in products", "in others"]
+    rows = [
+        [
+            part.name,
+            f"{part.columns:.2f}",
+            f"{part.calls:.0f}",
+            f"{1e6 * part.seconds / part.columns:.3f}" if part.columns else "",
+            f"{1e6 * part.seconds:.3f}",
+            *(
+                (f"{1e6 * part.waiting:.3f}", f"{part.operators}", f"{part.products:.0f}", f"{part.pointwise:.0f}")
+                if part.operators
+                else [""] * 4
+            ),
+        ]
+        for part in cost.parts
+    ]
+    typer.echo(markdown_table(head, rows))
+    for what, seconds in {
+        "all of it, CPU time on one thread": cost.seconds,
+        "the first four rows, if a torch call cost nothing": cost.without_calls(),
+        f"the floor: their operations at the {cost.product_rate / 1e9:.1f} GFLOP/s of torch.mm and the "
+        f"{cost.pointwise_rate / 1e9:.1f} of torch.addcmul on operands in the cache, and {1e6 * cost.functions:.2f} µs "
+        f"of sines and cosines": cost.floor(),
+    }.items():
+        typer.echo(f"\n{1e6 * seconds:.2f} µs a pose, {1.0 / seconds:,.0f} poses / s: {what}")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 # configurations worked on together: few enough for the cache, enough that a torch call costs less than its arithmetic
-_ON_CPU = 2048
+_ON_CPU = 3500
 _ON_GPU = 1 << 18
 # up to so many the number of torch calls is the cost, not the arithmetic
 FEW = 16

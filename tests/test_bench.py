@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.experiments import peers
 from grr_torch.experiments.profile import profile_build
+from grr_torch.experiments.projection_cost import count_operators, projection_cost
 from grr_torch.experiments.speed import SECTIONS, measure_speed
 from grr_torch.experiments.timing import in_fresh_process, median_seconds, peak_memory
 
@@ -64,7 +65,8 @@ def test_memory_is_that_of_the_process_alone():
 
 
 def test_a_profile_adds_up_to_a_build(planar_5):
-    stages = profile_build(planar_5, "position")
+    stages, vertices = profile_build(planar_5, "position", points=300)
+    assert 200 < vertices < 500
     by_name = {stage.name: stage for stage in stages}
     assert by_name["poses"].calls > 10
     assert by_name["damped least squares"].seconds > 0.0
@@ -108,3 +110,26 @@ def test_bad_options_are_one_line(option):
 def test_every_section_is_in_the_help():
     result = CliRunner().invoke(app, ["bench", "speed", "--help"], env={"COLUMNS": "300", "TERM": "dumb"})
     assert all(name in result.output for name in SECTIONS)
+
+
+def test_the_parts_of_a_projection_are_counted_where_they_run(kinova):
+    cost = projection_cost(kinova, count=200, repeats=2)
+    parts = {part.name: part for part in cost.parts}
+    evaluated, stepped = parts["poses of the frames"], parts["steps: damped least squares"]
+    # every pose is evaluated at least once more than it is stepped, and nearly all need two steps or more
+    assert parts["errors"].columns == evaluated.columns
+    assert evaluated.columns >= stepped.columns + 0.99
+    assert 2.0 < stepped.columns < 6.0
+    assert 0.0 <= parts["steps again, at limits"].columns < 0.5 * stepped.columns
+    assert cost.floor() > 0.0
+    assert cost.functions > 0.0
+    # a product of 5 × 4 × 3 a joint, and of 4 × 4 × 3 for the tool
+    assert evaluated.products == pytest.approx(7 * 2 * 60 + 2 * 48)
+
+
+def test_operators_are_counted_with_their_operations():
+    a, b = torch.ones(3, 5), torch.ones(5, 7)
+    counter = count_operators(lambda: (a @ b).addcmul_(a[:, :1], b[:1]).view(21).sum())
+    assert counter.operators == 3
+    assert counter.products == 2 * 3 * 5 * 7
+    assert counter.pointwise == 2 * 21 + 21

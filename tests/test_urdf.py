@@ -74,6 +74,13 @@ def test_a_held_joint_of_the_chain_is_no_degree_of_freedom(load):
     assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.25)
 
 
+def test_the_chain_is_made_once_and_only_when_asked_for(load):
+    robot = load(robot_text(hinge("j", "a", "b")))
+    assert "chain" not in vars(robot)
+    assert robot.chain is robot.chain
+    assert robot.with_margin(0.0).chain.get_joint_parameter_names() == ["j"]
+
+
 def test_a_mimic_joint_follows_and_narrows_the_limits(load):
     mimic = '<limit lower="-1" upper="1" effort="1" velocity="2"/><mimic joint="i" multiplier="2" offset="0.5"/>'
     robot = load(robot_text(hinge("i", "a", "b"), hinge("j", "b", "c", extra=mimic), links="abc"))

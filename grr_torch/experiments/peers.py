@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator
@@ -66,6 +65,7 @@ def pinocchio_jacobian(robot: Robot, q: Tensor) -> Callable[[], Any]:
     import pinocchio
 
     with _bare_urdf(robot) as path:
+        # without continuous joints: an entry of a configuration a joint
         model = pinocchio.buildModelFromUrdf(str(path))
     data, frame = model.createData(), model.getFrameId(robot.tool)
     world = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
@@ -73,9 +73,7 @@ def pinocchio_jacobian(robot: Robot, q: Tensor) -> Callable[[], Any]:
     for values in q.tolist():
         row = pinocchio.neutral(model)
         for name, value in zip(robot.joint_names, values, strict=True):
-            joint = model.joints[model.getJointId(name)]
-            entry = [value] if joint.nq == 1 else [math.cos(value), math.sin(value)]
-            row[joint.idx_q : joint.idx_q + joint.nq] = entry
+            row[model.joints[model.getJointId(name)].idx_q] = value
         rows.append(row)
     out = np.empty((len(rows), 6, model.nv))
 

@@ -13,14 +13,10 @@ from grr_torch.robots.robot import Robot
 
 # what a build spends its time in, by file and function; each without what is listed beside it
 STAGES: dict[str, set[tuple[str, str | None]]] = {
-    "poses": {("kinematics", "_frames_of_many"), ("kinematics", "_frames_of_few"), ("kinematics", "place")},
     "Jacobians": {("kinematics", "jacobian")},
-    "damped least squares": {
-        ("columns", "damped_least_squares"),
-        ("columns", "solve_spd"),
-        ("columns", "transposed_product"),
-    },
-    "projection, rest": {("project", None), ("task", None), ("rotation", None)},
+    "poses": {("kinematics", None)},
+    "damped least squares": {("columns", None)},
+    "projection, rest": {("project", None), ("step", None), ("task", None), ("rotation", None)},
     "self-collision": {("self_collision", None)},
     "averages of neighbours": {("expand", "_average"), ("lattice", None), ("configuration", None), ("graph", None)},
     "bisection": {("continuity", None)},
@@ -42,14 +38,22 @@ class Stage:
     calls: int
 
 
-def profile_build(robot: Robot, task: str) -> list[Stage]:
+def profile_build(robot: Robot, task: str, points: int | None = None) -> tuple[list[Stage], int]:
     """Own time by stage, of a second build; torch's operators count for the function that calls them.
 
     The profiler itself costs something: the sum is more than a build takes.
+
+    Args:
+        robot: A bundled robot.
+        task: "position" or "fixed-rotation".
+        points: About how many vertices; by default as many as the paper's.
+
+    Returns:
+        The stages, and how many vertices there are.
     """
     build(robot, task, refine=False)
     profiler = cProfile.Profile(builtins=False)
-    profiler.runcall(build, robot, task, refine=False)
+    roadmap = profiler.runcall(build, robot, task, points=points, refine=False)
     seconds = dict.fromkeys([*STAGES, "everything else"], 0.0)
     calls = dict.fromkeys(seconds, 0)
     package = Path(grr_torch.__file__).parent
@@ -58,7 +62,7 @@ def profile_build(robot: Robot, task: str) -> list[Stage]:
         name = _stage(stem, function)
         seconds[name] += own
         calls[name] += count
-    return [Stage(name, seconds[name], calls[name]) for name in seconds]
+    return [Stage(name, seconds[name], calls[name]) for name in seconds], len(roadmap.points)
 
 
 def _stage(stem: str, function: str) -> str:

@@ -18,6 +18,7 @@ from grr_torch.experiments.peers import (
     pinocchio_jacobian,
     pytorch_kinematics_jacobian,
 )
+from grr_torch.experiments.projection_cost import AnyPose, PoseProblem
 from grr_torch.experiments.timing import in_fresh_process, machine, median_process_seconds, median_seconds
 from grr_torch.pieces import in_pieces
 from grr_torch.progress import Progress, silent
@@ -25,14 +26,11 @@ from grr_torch.projection.project import DEFAULT_TOLERANCES, project_columns
 from grr_torch.resolution.build import build
 from grr_torch.robots.load import load_robot
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.rotation import rotation_error
-from grr_torch.spaces.task import Position
 
-# how far from a solution the projection starts, in every joint [rad]
-_PERTURBATION = 0.3
 # configurations that a peer is asked for one by one
 _ONE_BY_ONE = 10_000
-_GROWTH = (3_299, 30_000, 300_000)
+# vertices, about, of builds that are compared
+GROWTH = (3_299, 30_000, 300_000)
 
 
 @dataclass(frozen=True)
@@ -154,40 +152,21 @@ def _kinematics(bench: _Bench) -> Iterator[Row]:
         yield Row(f"pose + Jacobian, N = {count:,}", "µs a configuration", per_one.pop(""), per_one)
 
 
-class _AnyPose(Position):
-    """Poses as columns of position and rotation matrix."""
-
-    @property
-    def width(self) -> int:
-        return 12
-
-    @property
-    def constraints(self) -> int:
-        return 6
-
-    def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
-        return rotation_error(targets[3:].view(3, 3, -1), rotation)
-
-
 def _projection(bench: _Bench) -> Iterator[Row]:
-    robot, task, count = bench.robot, _AnyPose(3), 10_000
-    q = bench.sample(count)
-    position, rotation = robot.forward_kinematics(q)
-    noise = torch.rand(count, robot.n, dtype=q.dtype, generator=torch.Generator().manual_seed(1)).to(q)
-    guesses = (q + _PERTURBATION * (2.0 * noise - 1.0)).clamp(robot.lower, robot.upper)
-    targets = torch.cat([position, rotation.reshape(count, 9)], dim=1).T.contiguous()
-    columns = robot.columns(guesses)
+    robot, count = bench.robot, 10_000
+    problem = PoseProblem.sample(robot, count)
+    targets, columns = problem.columns()
 
     def ours() -> Tensor:
-        return project_columns(robot, task, targets, columns, check_collision=False)[1]
+        return project_columns(robot, AnyPose(3), targets, columns, check_collision=False)[1]
 
     calls: dict[str, Callable[[], Any]] = {}
     more = {"valid": float(ours().double().mean())}
     if "Klampt" in bench.peers:
-        calls["Klampt"] = klampt_ik(robot, position, rotation, guesses, DEFAULT_TOLERANCES)
+        calls["Klampt"] = klampt_ik(robot, problem.position, problem.rotation, problem.guesses, DEFAULT_TOLERANCES)
         more["valid, Klampt"] = calls["Klampt"]() / count
     if "pytorch-kinematics" in bench.peers:
-        calls["pk"] = pytorch_kinematics_jacobian(robot, q)
+        calls["pk"] = pytorch_kinematics_jacobian(robot, problem.guesses)
     seconds = bench.seconds(ours, calls)
     if "pk" in seconds:
         more["pytorch-kinematics' jacobian in these turns, µs a configuration"] = 1e6 * seconds.pop("pk") / count
@@ -234,7 +213,7 @@ def _processes(bench: _Bench) -> Iterator[Row]:
 
 
 def _growth(bench: _Bench) -> Iterator[Row]:
-    for points in _GROWTH:
+    for points in GROWTH:
         (vertices, seconds), peak = in_fresh_process(_grow, points, str(bench.robot.device))
         more = {"s": seconds, "peak MiB of the process": peak}
         yield Row(f"build, kinova position, {vertices:,} vertices", "µs a vertex", 1e6 * seconds / vertices, {}, more)

@@ -24,13 +24,17 @@ def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Te
         normal.diagonal(dim1=1, dim2=2).add_(damping[:, None])
         factor = torch.linalg.cholesky_ex(normal)[0]
         return (rows.mT @ torch.cholesky_solve(error.T[..., None], factor))[..., 0].T
+    m, _, count = jacobian.shape
+    block = jacobian.new_empty(m, m + 1, count)
+    normal, right = block.split_with_sizes((m, 1), 1)
     # a joint at a time: all products at once would leave the cache
     first, *others = jacobian.unbind(1)
-    normal = first[:, None] * first
+    torch.mul(first[:, None], first, out=normal)
     for column in others:
         normal.addcmul_(column[:, None], column)
     normal.diagonal(dim1=0, dim2=1).add_(damping[:, None])
-    return transposed_product(jacobian, solve_spd(normal, error[:, None])[:, 0])
+    right.copy_(error[:, None])
+    return transposed_product(jacobian, _eliminate(block, m)[:, 0])
 
 
 def null_space_projector(jacobian: Tensor, damping: float) -> Tensor:
@@ -66,13 +70,17 @@ def solve_spd(matrix: Tensor, right: Tensor) -> Tensor:
     Returns:
         (m, k, N) solutions.
     """
-    m = len(matrix)
-    block = torch.cat([matrix, right], dim=1)
-    for columns_left in range(block.shape[1] - 1, right.shape[1] - 1, -1):
+    return _eliminate(torch.cat([matrix, right], dim=1), len(matrix))
+
+
+def _eliminate(block: Tensor, m: int) -> Tensor:
+    """`solve_spd` of systems (m, m + k, N), A beside B."""
+    _, width, count = block.shape
+    for columns_left in range(width - 1, width - m - 1, -1):
         column, others = block.split_with_sizes((1, columns_left), 1)
         pivot, factors = column.split_with_sizes((1, m - 1))
         row, rest = others.split_with_sizes((1, m - 1))
-        block = torch.empty_like(others)
+        block = block.new_empty(m, columns_left, count)
         # the row goes last: after m steps all are back in order
         cleared, last = block.split_with_sizes((m - 1, 1))
         torch.div(row, pivot, out=last)

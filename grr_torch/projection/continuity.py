@@ -15,7 +15,7 @@ from grr_torch.spaces.task import TaskSpace
 
 # with c > 1 the recursion need not end: what is unfinished at this depth is broken
 _DEPTH = 20
-# and so is an edge that has come to this many pieces, each longer than ε
+# and so is an edge of which a bisection gives more halves than this, those counted that are short enough
 _PIECES = 1 << 12
 
 

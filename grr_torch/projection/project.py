@@ -14,23 +14,19 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread, piece, slices
-from grr_torch.projection.columns import damped_least_squares
+from grr_torch.projection.step import Equations, Limits, free_step, stop_at_limits
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import normalise
 from grr_torch.spaces.task import TaskSpace
 
 # metres that a radian of rotation error counts as
 _ROTATION_LENGTH = 0.3
-# longest step of a joint [rad or m]
-_LONGEST_STEP = 0.5
-# a step shorter than this [rad or m], with an error left, is one from a stationary point
-_SHORTEST_STEP = 1e-9
 # λ = _DAMPING · ½‖e‖² + _LEAST_DAMPING
 _DAMPING = 0.1
 _LEAST_DAMPING = 1e-7
 # a configuration is given up when its error has not fallen by a tenth in so many iterations
 _PATIENCE = 4
-# columns that are done leave the batch when so many are left of it
+# columns that are done leave a batch, or its piece, when less than so many are left of it
 _LEFT = 0.75
 
 
@@ -121,169 +117,138 @@ def project_columns(
 ) -> tuple[Tensor, Tensor]:
     """`project` for columns: targets (width, N) and guesses (n, N) give configurations (n, N) and valid (N,)."""
     with torch.no_grad(), one_thread():
-        solved, valid = _converge(robot, task, targets, q, tolerances)
+        limits = Limits.of(robot)
+        workspace = robot.tree.workspace(q, min(q.shape[1], piece(q.device)))
+        solved, valid = _Projection(robot, task, tolerances, limits, workspace).converge(targets, q)
         solved = normalise(solved, robot.continuous[:, None])
         if check_collision and robot.spheres is not None:
             converged = valid.nonzero()[:, 0]
-            hit = robot.columns_in_self_collision(_take(solved, converged))
+            hit = robot.columns_in_self_collision(solved.index_select(1, converged))
             valid[converged[hit]] = False
         return torch.where(valid, solved, torch.nan), valid
 
 
 class _Batch(NamedTuple):
-    """Columns that have not converged.
+    """Columns that are not known to have converged.
 
     Attributes:
         rank: (M,) where their results belong.
         targets: (width, M).
-        q: (n, M).
-        best: (M,) least squared error so far.
+        q: (n, M), changed in place.
+        best: (M,) least squared error so far, changed in place.
+        before: (M,) what that was when patience was last asked for.
     """
 
     rank: Tensor
     targets: Tensor
     q: Tensor
     best: Tensor
+    before: Tensor
 
-    def take(self, columns: Tensor | slice) -> _Batch:
-        return _Batch(*(tensor[..., columns] for tensor in self))
+    def take(self, columns: Tensor) -> _Batch:
+        return _Batch(*(tensor.index_select(-1, columns) for tensor in self))
 
 
-def _converge(
-    robot: Robot, task: TaskSpace, targets: Tensor, q: Tensor, tolerances: Tolerances
-) -> tuple[Tensor, Tensor]:
-    """Configurations (n, N), NaN where not converged, and converged (N,).
+@dataclass(frozen=True)
+class _Projection:
+    """What stays the same from the first iteration to the last.
 
-    After every few iterations, what the pieces of a long batch have left is put together.
+    An iteration goes through the batch piece by piece; it evaluates a piece and steps it while it is in the cache.
+    What is too narrow for that is put together over all pieces first: the columns left of a piece that has mostly
+    converged, and those of which a joint would leave its range.
     """
-    limits = _limits(robot)
-    count = q.shape[1]
-    solved = torch.full_like(q, torch.nan)
-    valid = torch.zeros(count, dtype=torch.bool, device=q.device)
-    rank = torch.arange(count, device=q.device)
-    batch = _Batch(rank, targets, q if limits is None else q.clamp(*limits), torch.full_like(q[0], torch.inf))
-    workspace = robot.tree.workspace(q, min(count, piece(q.device)))
-    left = tolerances.iterations + 1
-    while left > 0 and len(batch.rank):
-        rounds = min(_PATIENCE, left)
-        left -= rounds
-        parts = [
-            _iterate(robot, task, batch.take(part), tolerances, rounds, left == 0, limits, workspace, solved, valid)
-            for part in slices(len(batch.rank), q.device)
-        ]
-        batch = (
-            parts[0] if len(parts) == 1 else _Batch(*(torch.cat(tensors, -1) for tensors in zip(*parts, strict=True)))
-        )
-    return solved, valid
 
+    robot: Robot
+    task: TaskSpace
+    tolerances: Tolerances
+    limits: Limits | None
+    workspace: Tensor
 
-def _iterate(
-    robot: Robot,
-    task: TaskSpace,
-    batch: _Batch,
-    tolerances: Tolerances,
-    rounds: int,
-    last: bool,
-    limits: tuple[Tensor, Tensor] | None,
-    workspace: Tensor,
-    solved: Tensor,
-    valid: Tensor,
-) -> _Batch:
-    """Some iterations of a batch; writes what converged and gives what is left and has come nearer.
+    def converge(self, targets: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Configurations (n, N), NaN where not converged, and converged (N,)."""
+        count = q.shape[1]
+        solved, valid = torch.full_like(q, torch.nan), torch.zeros(count, dtype=torch.bool, device=q.device)
+        start = q.clone() if self.limits is None else q.clamp(*self.limits)
+        far = torch.full_like(q[0], torch.inf)
+        batch = _Batch(torch.arange(count, device=q.device), targets, start, far, far.clone())
+        for iteration in range(self.tolerances.iterations + 1):
+            last = iteration == self.tolerances.iterations
+            done = self._iterate(batch, last)
+            patience = (iteration + 1) % _PATIENCE == 0
+            kept = ~done & (batch.best < 0.81 * batch.before) if patience else ~done
+            left = kept.nonzero()[:, 0]
+            if len(left) >= _LEFT * len(done) and not patience and not last:
+                continue
+            there = done.nonzero()[:, 0]
+            where = batch.rank[there]
+            solved[:, where], valid[where] = batch.q.index_select(1, there), True
+            if len(left) == 0:
+                break
+            batch = batch.take(left)
+            if patience:
+                batch.before.copy_(batch.best)
+        return solved, valid
 
-    What has converged stays in the batch, at no harm to itself, until it is a good part of it: to copy the rest each
-    time costs more.
-    """
-    rank, targets, q, before = batch
-    best = before
-    waiting = torch.ones_like(rank, dtype=torch.bool)
-    rows = task.dimension
-    for iteration in range(rounds):
-        frames = robot.tree.frames(q, workspace)
-        error = task.error(targets, *robot.tree.tool_pose(frames))
+    def _iterate(self, batch: _Batch, last: bool) -> Tensor:
+        """Evaluates a batch and steps what has not converged, unless it is the last time; (M,) has converged."""
+        every = torch.arange(len(batch.rank), device=batch.rank.device)
+        done = torch.empty_like(every, dtype=torch.bool)
+        few: list[Equations] = []
+        beyond: list[tuple[Equations, Tensor]] = []
+        for part in slices(len(every), every.device):
+            frames, error, size = self._evaluate(batch, part, done)
+            left = (~done[part]).nonzero()[:, 0]
+            if last or len(left) == 0:
+                continue
+            ahead: tuple[Tensor, ...] = (every[part], batch.q[:, part], frames, error, size)
+            if len(left) < _LEFT * len(size):
+                few.append(self._equations(*(tensor.index_select(-1, left) for tensor in ahead)))
+            else:
+                there = done[part] if len(left) < len(size) else None
+                batch.q[:, part] = self._step(self._equations(*ahead), beyond, there)
+        if few:
+            together = Equations.join(few)
+            for part in slices(len(together.columns), every.device):
+                equations = together.take(part)
+                batch.q.index_copy_(1, equations.columns, self._step(equations, beyond))
+        if self.limits is not None and beyond:
+            together, moved = Equations.join([e for e, _ in beyond]), torch.cat([m for _, m in beyond], -1)
+            batch.q.index_copy_(1, together.columns, stop_at_limits(self.limits, together, moved))
+        return done
+
+    def _evaluate(self, batch: _Batch, part: slice, done: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Frames, errors and their squared size (M,) of a piece; notes which of it has converged."""
+        rows = self.task.dimension
+        frames = self.robot.tree.frames(batch.q[:, part], self.workspace)
+        error = self.task.error(batch.targets[:, part], *self.robot.tree.tool_pose(frames))
         squared = error.square()
         translation, rotation = squared[:rows].sum(0), squared[rows:].sum(0)
-        done = (translation <= tolerances.position**2) & (rotation <= tolerances.rotation**2)
+        near = translation <= self.tolerances.position**2
+        torch.logical_and(near, rotation <= self.tolerances.rotation**2, out=done[part])
         size = translation.add_(rotation, alpha=_ROTATION_LENGTH**2)
-        best = torch.minimum(best, size)
-        finished = (waiting & done).nonzero()[:, 0]
-        if len(finished):
-            where = rank[finished]
-            solved[:, where], valid[where] = _take(q, finished), True
-            waiting = waiting & ~done
-            left = waiting.nonzero()[:, 0]
-            if len(left) < _LEFT * len(waiting):
-                rank, targets, q, error = rank[left], _take(targets, left), _take(q, left), _take(error, left)
-                best, before, size, frames = best[left], before[left], size[left], frames[..., left]
-                waiting = torch.ones_like(rank, dtype=torch.bool)
-        if len(rank) == 0 or (last and iteration == rounds - 1):
-            break
-        jacobian = task.jacobian(robot.tree.jacobian(frames))
+        torch.minimum(batch.best[part], size, out=batch.best[part])
+        return frames, error, size
+
+    def _equations(self, columns: Tensor, q: Tensor, frames: Tensor, error: Tensor, size: Tensor) -> Equations:
+        """Of a step, a radian counted as `_ROTATION_LENGTH` metres."""
+        rows = self.task.dimension
+        jacobian = self.task.jacobian(self.robot.tree.jacobian(frames))
         if len(error) > rows:
             error[rows:].mul_(_ROTATION_LENGTH)
             jacobian[rows:].mul_(_ROTATION_LENGTH)
-        q = _step(q, jacobian, error, size.mul(0.5 * _DAMPING).add_(_LEAST_DAMPING), limits)
-    kept = (waiting & (best < 0.81 * before)).nonzero()[:, 0]
-    return _Batch(rank, targets, q, best).take(kept)
+        return Equations(columns, q, jacobian, error, size.mul(0.5 * _DAMPING).add_(_LEAST_DAMPING))
 
+    def _step(self, equations: Equations, beyond: list[tuple[Equations, Tensor]], done: Tensor | None = None) -> Tensor:
+        """Configurations (n, M) after a step, clamped; those that are done stay.
 
-def _step(q: Tensor, jacobian: Tensor, error: Tensor, damping: Tensor, limits: tuple[Tensor, Tensor] | None) -> Tensor:
-    """Configurations after one step, within limits."""
-    step = damped_least_squares(jacobian, error, damping)
-    longest = step.abs().amax(0)
-    stuck = longest < _SHORTEST_STEP
-    if bool(stuck.any()):
-        # at a stationary point, such as a straight arm, any direction may lead on
-        step = torch.where(stuck, _nudge(q), step)
-    moved = torch.addcmul(q, step, _LONGEST_STEP / longest.clamp_min(_LONGEST_STEP))
-    if limits is None:
-        return moved
-    kept = moved.clamp(*limits)
-    stopped = kept != moved
-    columns = stopped.any(0).nonzero()[:, 0]
-    if len(columns):
-        parts = [part[..., columns] for part in (q, kept, stopped, jacobian, error, damping)]
-        kept[:, columns] = _stop_at_limits(limits, *parts)
-    return kept
-
-
-def _stop_at_limits(
-    limits: tuple[Tensor, Tensor],
-    q: Tensor,
-    kept: Tensor,
-    stopped: Tensor,
-    jacobian: Tensor,
-    error: Tensor,
-    damping: Tensor,
-) -> Tensor:
-    """Configurations after a step in which joints that would leave their range stop at its end, at `kept`.
-
-    The others make up for it: their step is solved for again, until no more of them would leave.
-    """
-    for _ in range(len(q)):
-        held = torch.where(stopped, kept - q, 0.0)
-        rest = error - (jacobian * held).sum(1)
-        step = held + damped_least_squares(jacobian * ~stopped, rest, damping)
-        moved = torch.addcmul(q, step, _LONGEST_STEP / step.abs().amax(0).clamp_min(_LONGEST_STEP))
-        kept = moved.clamp(*limits)
-        beyond = (kept != moved) & ~stopped
-        if not bool(beyond.any()):
-            break
-        stopped = stopped | beyond
-    return kept
-
-
-def _limits(robot: Robot) -> tuple[Tensor, Tensor] | None:
-    """Limits (n, 1) as columns; None where no joint has any."""
-    if bool(robot.lower.isinf().all() & robot.upper.isinf().all()):
-        return None
-    return robot.lower[:, None], robot.upper[:, None]
-
-
-def _nudge(q: Tensor) -> Tensor:
-    """A small step (n, 1) that moves every joint differently."""
-    return 0.05 * torch.cos(torch.arange(1, len(q) + 1, dtype=q.dtype, device=q.device))[:, None]
-
-
-def _take(columns: Tensor, kept: Tensor) -> Tensor:
-    return columns.index_select(1, kept)
+        Appends to `beyond` those of which a joint was stopped at a limit, and where they would have gone.
+        """
+        moved = free_step(equations)
+        kept = moved if self.limits is None else moved.clamp(*self.limits)
+        if self.limits is not None:
+            # of bytes, the largest is found faster than whether any is true
+            stopped = (kept != moved).view(torch.uint8).amax(0)
+            which = (stopped if done is None else stopped * ~done).nonzero()[:, 0]
+            if len(which):
+                beyond.append((equations.take(which), moved.index_select(1, which)))
+        return kept if done is None else torch.where(done, equations.q, kept)

@@ -75,31 +75,35 @@ class KinematicTree:
 
     def workspace(self, like: Tensor, width: int) -> Tensor:
         """Memory for `frames` of up to `width` configurations; to ask the system for it each time takes longer."""
-        return like.new_empty((12 * (len(self.joints) + 2) + 18) * width)
+        return like.new_empty(12 * (len(self.joints) + 2) * width)
 
     def _frames_of_many(self, q: Tensor, workspace: Tensor) -> Tensor:
-        """Joint by joint, parents first: 84 multiply-adds a joint and configuration, four passes, in place."""
+        """Joint by joint, parents first: 72 multiply-adds a joint and configuration, three passes, in place.
+
+        What has yet to be turned is put where the next frame comes to lie.
+        """
         width, count = q.shape[1], len(self.joints)
         values = self._joint_values(q, self._joint_matrices[3][:count])
-        cosines, sines = values.cos().unbind(0), values.sin().unbind(0)
-        size = 12 * (count + 2) * width
-        frames = workspace[:size].view(count + 2, 4, 3, width)
-        scratch = workspace[size : size + 18 * width].view(6, 3, width)
+        cosines, sine = values.cos().unbind(0), values.sin()
+        sines = torch.stack([sine, -sine], 1)[:, :, None].unbind(0)
+        frames = workspace[: 12 * (count + 2) * width].view(count + 2, 4, 3, width)
         frames[-1] = torch.eye(4, 3, dtype=q.dtype, device=q.device)[:, :, None]
-        flat, at_zero = frames.view(count + 2, 4, 3 * width).unbind(0), scratch.view(6, 3 * width)
-        turned, rest = (half.unbind(0) for half in frames.split(2, dim=1))
-        xy, yx, zp = scratch.split(2)
+        whole, turned = frames.view(count + 2, 4, -1).unbind(0), frames[:, :2].unbind(0)
+        # rows z, origin, x, y, x at value zero, the first two in their place
+        size = 3 * width
+        mounted = frames.as_strided((count, 5, size), (4 * size, size, 1), frames.storage_offset() + 2 * size)
+        xy, yx = (mounted[:, k : k + 2].view(count, 2, 3, width).unbind(0) for k in (2, 3))
+        at_zero = mounted.unbind(0)
         for index, (joint, mount) in enumerate(zip(self.joints, self._turning_mounts, strict=True)):
-            torch.mm(mount, flat[joint.parent], out=at_zero)
-            rest[index].copy_(zp)
+            torch.mm(mount, whole[joint.parent], out=at_zero[index])
             if joint.revolute:
                 # x' = c·x + s·y and y' = c·y − s·x, both at once
-                torch.mul(xy, cosines[index], out=turned[index]).addcmul_(yx, sines[index])
+                torch.mul(xy[index], cosines[index], out=turned[index]).addcmul_(yx[index], sines[index])
             else:
-                turned[index].copy_(xy)
-                rest[index][1].addcmul_(zp[0], values[index])
+                turned[index].copy_(xy[index])
+                frames[index, 3].addcmul_(frames[index, 2], values[index])
         index, mount = self.links[self.tool]
-        torch.mm(mount, flat[index], out=flat[-2])
+        torch.mm(mount, whole[index], out=whole[-2])
         return frames
 
     def _frames_of_few(self, q: Tensor) -> Tensor:
@@ -186,8 +190,8 @@ class KinematicTree:
 
     @cached_property
     def _turning_mounts(self) -> tuple[Tensor, ...]:
-        """Mounts as (6, 4): rows x, y, y, −x, z, origin."""
-        return tuple(torch.stack([m[0], m[1], m[1], -m[0], m[2], m[3]]) for m in self.mounts)
+        """Mounts as (5, 4): rows z, origin, x, y, x."""
+        return tuple(mount[[2, 3, 0, 1, 0]] for mount in self.mounts)
 
     @cached_property
     def _sliding(self) -> Tensor | None:

@@ -12,7 +12,6 @@ from pathlib import Path
 import torch
 
 from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError, UrdfError
-from grr_torch.robots.chain import serial_chain
 from grr_torch.robots.compile_tree import compile_tree, degrees_of_freedom
 from grr_torch.robots.presets import Preset, load_preset, robot_names
 from grr_torch.robots.read_urdf import read_urdf
@@ -97,9 +96,7 @@ def make_robot(
 ) -> Robot:
     """Makes a `Robot` from a validated URDF; see `load_robot`."""
     held = _held(urdf, held_joints)
-    urdf.path(base, tool)  # names what is wrong before pytorch-kinematics sees it
-    chain = serial_chain(urdf, base, tool, held, dtype=dtype, device=device)
-    path = [urdf.joints[joint.name] for joint in chain.get_joints(exclude_fixed=False) if joint.name in urdf.joints]
+    path = urdf.path(base, tool)
     moving = degrees_of_freedom(path, held)
     if not moving:
         raise UrdfError(urdf.name, f"no movable joint between base '{base}' and tool '{tool}'")
@@ -118,7 +115,6 @@ def make_robot(
         urdf=urdf,
         base=base,
         tool=tool,
-        chain=chain,
         joint_names=tuple(figures),
         lower=lower,
         upper=upper,

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import in_pieces, piece
+from grr_torch.robots.chain import serial_chain
 from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.presets import Preset
 from grr_torch.robots.self_collision import SphereKernel
@@ -35,7 +36,6 @@ class Robot:
         urdf: The URDF it was read from.
         base: Link in whose frame poses are given.
         tool: Link whose pose is controlled.
-        chain: The chain as a `pytorch_kinematics.SerialChain`, in which mimic joints are degrees of freedom.
         joint_names: The n joints of a configuration.
         lower: (n,) lower position limits; −inf where there is none.
         upper: (n,) upper position limits; inf where there is none.
@@ -53,7 +53,6 @@ class Robot:
     urdf: Urdf
     base: str
     tool: str
-    chain: SerialChain
     joint_names: tuple[str, ...]
     lower: Tensor
     upper: Tensor
@@ -82,6 +81,14 @@ class Robot:
     def device(self) -> torch.device:
         """Device of all computations."""
         return self.lower.device
+
+    @cached_property
+    def chain(self) -> SerialChain:
+        """The chain as a `pytorch_kinematics.SerialChain`, in which mimic joints are degrees of freedom.
+
+        Made when it is first asked for, as pytorch-kinematics takes long to import.
+        """
+        return serial_chain(self.urdf, self.base, self.tool, self.held_joints, dtype=self.dtype, device=self.device)
 
     def with_margin(self, margin: float) -> Robot:
         """The same robot with another self-collision margin [m].

@@ -7,7 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import FEW
+# below any sine of an angle that is not 0, and above what a division makes infinite
+_TINY = 1e-30
+# cosines of angles to which the axis may have to be found otherwise
+_HALF_TURN = -1.0 + 1e-12
 
 
 def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Tensor:
@@ -70,26 +73,30 @@ def rotation_error(target: Tensor, rotation: Tensor) -> Tensor:
 
     Norms reach π; there, where the axis is not unique, one of the two is taken. 27 multiply-adds, an arctangent.
     """
-    # vee(T Rᵀ − R Tᵀ) / 2 = ½ Σ columns r × t = axis · sin(angle)
-    if rotation.shape[2] <= FEW:
-        twisted = 0.5 * torch.linalg.cross(rotation, target.expand_as(rotation), dim=0).sum(1)
-    else:
-        twisted = torch.stack(
-            [
-                (rotation[1] * target[2] - rotation[2] * target[1]).sum(0),
-                (rotation[2] * target[0] - rotation[0] * target[2]).sum(0),
-                (rotation[0] * target[1] - rotation[1] * target[0]).sum(0),
-            ]
-        ).mul_(0.5)
-    cosine = 0.5 * ((rotation * target).sum((0, 1)) - 1.0)
-    sine = twisted.square().sum(0).sqrt()
-    tiny = sine < 1e-7
-    error = twisted * torch.where(tiny, 1.0, torch.atan2(sine, cosine) / sine)
-    flipped = tiny & (cosine < 0.0)
+    turn = _product(target, rotation)
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(0) for row in turn.unbind(0))
+    # its antisymmetric part is axis · sin(angle), its trace 2 cos(angle) + 1
+    twisted = torch.stack([zy - yz, xz - zx, yx - xy]).mul_(0.5)
+    cosine = (xx + yy).add_(zz).sub_(1.0).mul_(0.5)
+    # the tiny number is lost beside any sine but 0
+    sine = twisted.square().sum(0).sqrt_().add_(_TINY)
+    error = twisted * torch.atan2(sine, cosine).div_(sine)
+    flipped = cosine < _HALF_TURN
     if bool(flipped.any()):
+        flipped &= sine < 1e-7
         # at π, T Rᵀ = 2 a aᵀ − 1: any column of T Rᵀ + 1 points along the axis
-        product = torch.einsum("ikN,jkN->ijN", target.expand_as(rotation), rotation)[..., flipped]
-        outer = product + torch.eye(3, dtype=product.dtype, device=product.device)[..., None]
+        outer = turn[..., flipped] + torch.eye(3, dtype=turn.dtype, device=turn.device)[..., None]
         column = torch.take_along_dim(outer, outer.norm(dim=0).argmax(0)[None, None], dim=1)[:, 0]
         error[:, flipped] = math.pi * column / column.norm(dim=0)
     return error
+
+
+def _product(target: Tensor, rotation: Tensor) -> Tensor:
+    """T Rᵀ (3, 3, N) for T (3, 3, 1 or N) and R (3, 3, N)."""
+    if target.shape[2] == 1:
+        return torch.mm(target[..., 0], rotation.transpose(0, 1).reshape(3, -1)).view_as(rotation)
+    first, *others = zip(target.unbind(1), rotation.unbind(1), strict=True)
+    product = first[0][:, None] * first[1]
+    for axis, other in others:
+        product.addcmul_(axis[:, None], other)
+    return product

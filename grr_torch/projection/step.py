@@ -1,0 +1,105 @@
+"""One damped least-squares step of many configurations, within joint limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from grr_torch.projection.columns import damped_least_squares
+from grr_torch.robots.robot import Robot
+
+# longest step of a joint [rad or m]
+_LONGEST_STEP = 0.5
+# a step shorter than this [rad or m], with an error left, is one from a stationary point
+_SHORTEST_STEP = 1e-9
+
+
+class Equations(NamedTuple):
+    """What a step solves for some columns of a batch: the shortest one that reduces the error, J · step ≈ e.
+
+    Attributes:
+        columns: (M,) which they are.
+        q: (n, M) configurations.
+        jacobian: (m, n, M).
+        error: (m, M).
+        damping: (M,) λ > 0.
+    """
+
+    columns: Tensor
+    q: Tensor
+    jacobian: Tensor
+    error: Tensor
+    damping: Tensor
+
+    def take(self, which: Tensor | slice) -> Equations:
+        """Some of them."""
+        return Equations(*(tensor[..., which] for tensor in self))
+
+    @classmethod
+    def join(cls, parts: Sequence[Equations]) -> Equations:
+        """All parts side by side."""
+        return parts[0] if len(parts) == 1 else cls(*(torch.cat(tensors, -1) for tensors in zip(*parts, strict=True)))
+
+
+class Limits(NamedTuple):
+    """Joint limits as columns.
+
+    Attributes:
+        lower: (n, 1).
+        upper: (n, 1).
+    """
+
+    lower: Tensor
+    upper: Tensor
+
+    @classmethod
+    def of(cls, robot: Robot) -> Limits | None:
+        """Those of a robot; None where no joint has any."""
+        if bool(robot.lower.isinf().all() & robot.upper.isinf().all()):
+            return None
+        return cls(robot.lower[:, None], robot.upper[:, None])
+
+
+def free_step(equations: Equations) -> Tensor:
+    """Configurations (n, M) after a step that knows no limits."""
+    step = damped_least_squares(equations.jacobian, equations.error, equations.damping)
+    longest = step.abs().amax(0)
+    stuck = longest < _SHORTEST_STEP
+    if bool(stuck.any()):
+        # at a stationary point, such as a straight arm, any direction may lead on
+        step = torch.where(stuck, _nudge(step), step)
+    return torch.addcmul(equations.q, step, _LONGEST_STEP / longest.clamp_min(_LONGEST_STEP))
+
+
+def stop_at_limits(limits: Limits, equations: Equations, moved: Tensor) -> Tensor:
+    """Configurations after a step in which joints that would leave their range stop at its end.
+
+    The others make up for it: their step is solved for again, until no more of them would leave.
+
+    Args:
+        limits: Of the joints.
+        equations: Of the step.
+        moved: (n, M) where `free_step` leads to.
+    """
+    _, q, jacobian, error, damping = equations
+    kept = moved.clamp(*limits)
+    stopped = kept != moved
+    for _ in range(len(q)):
+        held = torch.where(stopped, kept - q, 0.0)
+        rest = error - (jacobian * held).sum(1)
+        step = held + damped_least_squares(jacobian * ~stopped, rest, damping)
+        moved = torch.addcmul(q, step, _LONGEST_STEP / step.abs().amax(0).clamp_min(_LONGEST_STEP))
+        kept = moved.clamp(*limits)
+        beyond = (kept != moved) & ~stopped
+        if not bool(beyond.any()):
+            break
+        stopped = stopped | beyond
+    return kept
+
+
+def _nudge(step: Tensor) -> Tensor:
+    """A small step (n, 1) that moves every joint differently."""
+    return 0.05 * torch.cos(torch.arange(1, len(step) + 1, dtype=step.dtype, device=step.device))[:, None]
