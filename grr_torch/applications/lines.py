@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from grr_torch.projection.continuity import continuous_columns
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import difference, distance
@@ -17,6 +18,8 @@ from grr_torch.spaces.task import TaskSpace
 SUBSTEPS = 8
 # a line of more pieces is not followed at once
 _MOST_PIECES = 32
+# a gap between points on a line of so many ε is one to another posture, whatever joins them
+_WIDEST = 3.0
 # of the longest step, so that what the projection adds seldom has to be cut off
 _SLACK = 0.98
 
@@ -28,15 +31,17 @@ class Lines:
     Attributes:
         ends: (B, n) configurations at the lines' ends, NaN where not converged.
         steps: (B, n) where one control step leads; the end itself where it is near enough.
+        points: (B, width) where the tools are after the steps.
         converged: (B,) ends that meet their points.
         collides: (B,) of these, ends in self-collision.
         safe: (B,) steps that converge and are free of self-collision on the way.
-        direct: (B,) lines that can be followed: every point on the way converges, is free of self-collision, and no
-            two neighbouring ones are ε or more apart.
+        direct: (B,) lines that can be followed: every point on the way converges and is free of self-collision, and
+            neighbouring ones are less than ε apart or pass the continuity check.
     """
 
     ends: Tensor
     steps: Tensor
+    points: Tensor
     converged: Tensor
     collides: Tensor
     safe: Tensor
@@ -68,7 +73,8 @@ class Follower:
         """Follows lines, all their points at once.
 
         It asks what the recursion of IsContinuous asks where it ends: points on the line whose configurations are
-        less than ε apart. All of them, the step and the end are one projection, so that a step takes as long as one.
+        less than ε apart. All of them, the step and the end are one projection, so that a step takes as long as one;
+        only where that leaves a gap does the recursion go on.
 
         Args:
             q: (B, n) configurations.
@@ -107,10 +113,28 @@ class Follower:
         steps = self.limited(q, torch.where(near[:, None], ends, found[:, -2]))
         chain = torch.cat([q[:, None], found[:, :-2], ends[:, None]], dim=1)
         gaps = distance(chain[:, :-1], chain[:, 1:], robot.continuous)
+        wide = ~(gaps < self.epsilon)
         hit = self._hits(torch.cat([found[:, :-2], ends[:, None]], dim=1), q, steps)
         safe = torch.where(near, reached[:, -1], reached[:, -2]) & ~hit[:, count:].any(1)
-        direct = short & (gaps < self.epsilon).all(1) & safe & ~hit[:, :count].any(1)
-        return Lines(ends, steps, reached[:, -1], hit[:, count - 1], safe, direct)
+        direct = short & safe & reached[:, : count - 1].all(1) & reached[:, -1] & ~hit[:, :count].any(1)
+        direct &= (gaps < _WIDEST * self.epsilon).all(1)
+        if bool((direct[:, None] & wide).any()):
+            stops = torch.cat([torch.zeros_like(inner[:1]), inner, torch.ones_like(inner[:1])])
+            along = self.task.interpolate(p[:, None], targets[:, None], stops[:, None])
+            direct &= self._bridged(chain, along, direct[:, None] & wide)
+        after = torch.where(near[:, None], targets, self.task.interpolate(p, targets, share.clamp_max(1.0)[:, None]))
+        return Lines(ends, steps, after, reached[:, -1], hit[:, count - 1], safe, direct)
+
+    def _bridged(self, chain: Tensor, points: Tensor, wide: Tensor) -> Tensor:
+        """Lines (B,) that are continuous where neighbouring points (B, K + 1, …) of them are far apart (B, K)."""
+        rows, columns = wide.nonzero().unbind(1)
+        pairs = [(part[rows, columns].T, part[rows, columns + 1].T) for part in (points, chain)]
+        joined = continuous_columns(
+            self.robot, self.task, pairs[0], pairs[1], 0.5 * math.sqrt(self.robot.n), self.epsilon, self.tolerances
+        )
+        result = torch.ones(len(chain), dtype=torch.bool, device=chain.device)
+        result[rows[~joined]] = False
+        return result
 
     def limited(self, q: Tensor, towards: Tensor) -> Tensor:
         """Configurations (B, n) towards others by at most a step, continuous joints not wrapped."""

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from grr_torch.applications.hold import nearest_feasible
-from grr_torch.applications.lines import Follower, Lines
-from grr_torch.applications.rejoin import clearance, rejoin
+from grr_torch.applications.lines import Follower
+from grr_torch.applications.rejoin import rejoin
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
-from grr_torch.spaces.configuration import difference, distance
+from grr_torch.spaces.configuration import distance
 
 TRACKING, DETOURING, HOLDING, UNREACHABLE = range(4)
 
@@ -20,12 +21,30 @@ TRACKING, DETOURING, HOLDING, UNREACHABLE = range(4)
 _ENTRIES = 6
 _ENDS = 8
 _WAYS_BACK = 32
+# more than any distance of configurations [rad]
+_NOT_JOINED = 1e3
 # an arm so near [rad or m] to a vertex's configuration is at the vertex
 _ARRIVED = 1e-6
 # an arm so near [rad or m] to the map's configuration at its place is on the map
 _ON_MAP = 0.05
 # rotation errors up to so many tolerances are made good on the way; with larger ones an arm is off its task
 _OFF_TASK = 10.0
+
+
+class Steps(NamedTuple):
+    """What A arms do next.
+
+    Attributes:
+        q: (A, n) configurations after the step.
+        goals: (A, n) configurations that the step leads to; NaN where they are not known.
+        points: (A, width) where the tools are then, on their task; NaN where that is to be looked at.
+        codes: (A,) status codes.
+    """
+
+    q: Tensor
+    goals: Tensor
+    points: Tensor
+    codes: Tensor
 
 
 @dataclass(eq=False)
@@ -56,17 +75,22 @@ class Arms:
         nothing = q.new_full((len(q), follower.task.width), torch.nan)
         off, no_vertex = torch.zeros(len(q), dtype=torch.bool), torch.full((len(q),), -1)
         arms = Arms(q, torch.zeros_like(q), nothing, off, nothing.clone(), q * torch.nan, no_vertex)
-        arms.look(follower)
+        arms.look(follower, torch.arange(len(q)))
         return arms
 
-    def look(self, follower: Follower) -> None:
-        """Finds out where the tools are, and which arms are on their task."""
-        robot, task = follower.robot, follower.task
-        position, rotation = robot.forward_kinematics(self.q)
-        self.p = position[:, : task.dimension]
-        error = task.error(self.p.T, position.T, rotation.permute(1, 2, 0))
+    def look(self, follower: Follower, which: Tensor) -> None:
+        """Finds out where the tools of some arms (A,) are, and whether these arms are on their task."""
+        robot, task, q = follower.robot, follower.task, self.q[which]
+        position, rotation = robot.forward_kinematics(q)
+        self.p[which] = position[:, : task.dimension]
+        error = task.error(self.p[which].T, position.T, rotation.permute(1, 2, 0))
         turned = task.residuals(error)[1] <= _OFF_TASK * follower.tolerances.rotation
-        self.on_task = turned & robot.within_limits(self.q) & ~robot.in_self_collision(self.q)
+        self.on_task[which] = turned & robot.within_limits(q) & ~robot.in_self_collision(q)
+
+    def forget(self, which: Tensor) -> None:
+        """Arms (A,) that have no more need of a route or a point to hold at."""
+        self.held[which] = self.held_q[which] = torch.nan
+        self.next_vertex[which] = -1
 
 
 class Pilot:
@@ -75,58 +99,60 @@ class Pilot:
     def __init__(self, follower: Follower, solver: Solver, routes: Routes) -> None:
         self.follower, self.solver, self.routes = follower, solver, routes
 
-    def steps(self, arms: Arms, which: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The next step of some arms (A,) that are given targets (A, width).
-
-        Returns:
-            Configurations after it (A, n), what they lead to (A, n), NaN where that is not known, and status codes (A,).
-        """
+    def steps(self, arms: Arms, which: Tensor, targets: Tensor) -> Steps:
+        """The next step of some arms (A,) that are given targets (A, width)."""
         guesses, codes = self.solver.guess(targets.cpu())
         known = (codes <= 1).to(targets.device)
-        q, p = arms.q[which], arms.p[which]
-        lines = self.follower.follow(q, p, torch.where(known[:, None], guesses.to(q), q), targets)
-        valid = known & lines.converged & ~lines.collides & self.solver.on_map(lines.ends, guesses.to(q))
+        q, p, guesses = arms.q[which], arms.p[which], guesses.to(targets)
+        lines = self.follower.follow(q, p, torch.where(known[:, None], guesses, q), targets)
+        valid = known & lines.converged & ~lines.collides & self.solver.on_map(lines.ends, guesses)
         direct = valid & lines.direct & arms.on_task[which]
-        result, ends, status = lines.steps, lines.ends, torch.full((len(which),), TRACKING)
-        tracking = which[direct]
-        arms.held[tracking] = arms.held_q[tracking] = torch.nan
-        arms.next_vertex[tracking] = -1
+        steps = Steps(lines.steps, lines.ends, lines.points, torch.full((len(which),), TRACKING))
+        if bool(direct.all()):
+            arms.forget(which)
+            return steps
+        arms.forget(which[direct])
         rest = (~direct).nonzero()[:, 0]
-        if len(rest):
-            result[rest], ends[rest], status[rest] = self._indirect(
-                arms, which[rest], targets[rest], valid[rest], lines.ends[rest]
-            )
-        return result, ends, status
+        others = self._indirect(arms, which[rest], targets[rest], valid[rest], lines.ends[rest])
+        for part, other in zip(steps, others, strict=True):
+            part[rest] = other
+        return steps
 
-    def _indirect(
-        self, arms: Arms, which: Tensor, targets: Tensor, valid: Tensor, ends: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _indirect(self, arms: Arms, which: Tensor, targets: Tensor, valid: Tensor, ends: Tensor) -> Steps:
         """`steps` of arms that cannot go straight to their targets; `ends` are configurations where `valid`."""
         goals, goals_q = targets.clone(), ends.clone()
-        result, status = arms.q[which].clone(), torch.full((len(which),), DETOURING)
+        unknown = torch.full_like(goals, torch.nan)
+        codes = torch.full((len(which),), DETOURING)
+        steps = Steps(arms.q[which].clone(), torch.full_like(ends, torch.nan), unknown, codes)
         left = torch.ones_like(valid)
         lost = (~valid).nonzero()[:, 0]
         if len(lost):
-            those = which[lost]
-            unset = arms.held[those].isnan().any(1)
-            base = torch.where(unset[:, None], arms.p[those], arms.held[those])
-            goals[lost], goals_q[lost] = nearest_feasible(self.solver, base, arms.held_q[those], targets[lost])
-            arms.held[those], arms.held_q[those] = goals[lost], goals_q[lost]
-            lines = self.follower.follow(arms.q[those], arms.p[those], goals_q[lost], goals[lost])
-            straight = lines.direct & arms.on_task[those]
-            result[lost[straight]], left[lost[straight]] = lines.steps[straight], False
-            status[lost[straight]] = UNREACHABLE
-            arms.next_vertex[those[straight]] = -1
+            goals[lost], goals_q[lost] = self._hold(arms, which[lost], targets[lost])
+            lines = self.follower.follow(arms.q[which[lost]], arms.p[which[lost]], goals_q[lost], goals[lost])
+            straight = lines.direct & arms.on_task[which[lost]]
+            rows = lost[straight]
+            arms.next_vertex[which[rows]] = -1
+            steps.q[rows], steps.goals[rows], steps.points[rows] = (
+                part[straight] for part in (lines.steps, lines.ends, lines.points)
+            )
+            steps.codes[rows], left[rows] = UNREACHABLE, False
         routed = (left & arms.on_task[which]).nonzero()[:, 0]
         if len(routed):
-            result[routed], left[routed] = self._route(arms, which[routed], goals[routed], goals_q[routed])
+            steps.q[routed], left[routed] = self._route(arms, which[routed], goals[routed], goals_q[routed])
         for row in left.nonzero()[:, 0].tolist():
             step = self._back(arms, int(which[row]), goals_q[row])
             if step is None:
-                status[row] = HOLDING
+                steps.codes[row] = HOLDING
             else:
-                result[row] = step
-        return result, torch.where(status[:, None] == UNREACHABLE, goals_q, torch.nan), status
+                steps.q[row] = step
+        return steps
+
+    def _hold(self, arms: Arms, which: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+        """The nearest points to targets (A, width) that arms can go to, with configurations; the arms keep them."""
+        unset = arms.held[which].isnan().any(1)
+        base = torch.where(unset[:, None], arms.p[which], arms.held[which])
+        arms.held[which], arms.held_q[which] = nearest_feasible(self.solver, base, arms.held_q[which], targets)
+        return arms.held[which], arms.held_q[which]
 
     def _route(self, arms: Arms, which: Tensor, goals: Tensor, goals_q: Tensor) -> tuple[Tensor, Tensor]:
         """Steps (A, n) of arms on shortest paths to goals, and which found no way (A,)."""
@@ -180,11 +206,21 @@ class Pilot:
                 arms.next_vertex[which[row]] = vertex[best]
 
     def _last_vertices(self, goals: Tensor, goals_q: Tensor) -> list[int]:
-        """Of the vertices round each goal, the one whose configuration is most like the goal's."""
+        """Of the vertices round each goal that it is joined to by a continuous line, the one most like it.
+
+        Of all of them, where there is no such line.
+        """
         vertices = self.solver.nearest(goals.cpu(), _ENDS)[1]
-        apart = distance(
-            self.solver.configurations[vertices].to(goals_q), goals_q[:, None], self.follower.robot.continuous
+        placed = self.solver.configurations[vertices].to(goals_q)
+        apart = distance(placed, goals_q[:, None], self.follower.robot.continuous)
+        count = vertices.shape[1]
+        lines = self.follower.follow(
+            goals_q.repeat_interleave(count, 0),
+            goals.repeat_interleave(count, 0),
+            placed.reshape(-1, placed.shape[2]),
+            self.solver.points[vertices].to(goals).reshape(-1, goals.shape[1]),
         )
+        apart += torch.where(lines.direct.reshape(apart.shape), 0.0, _NOT_JOINED)
         return vertices.gather(1, apart.cpu().argmin(1)[:, None])[:, 0].tolist()
 
     def _back(self, arms: Arms, arm: int, goal_q: Tensor) -> Tensor | None:

@@ -1,4 +1,4 @@
-"""Teleoperation on a roadmap: the paper's pipeline (Section IV-E), one control step at a time, for any number of arms."""
+"""Teleoperation on a roadmap: the paper's pipeline (Section IV-E), a control step at a time, for any number of arms."""
 
 from __future__ import annotations
 
@@ -161,14 +161,18 @@ class Teleoperator:
         arms = self._arms
         assert arms is not None
         q, goals, codes = arms.q.clone(), arms.q.clone(), torch.full((len(targets),), HOLDING)
+        points = arms.p.clone()
         which = accepted.nonzero()[:, 0]
         if len(which):
-            q[which], goals[which], codes[which] = self._pilot.steps(arms, which, targets[which])
+            q[which], goals[which], points[which], codes[which] = self._pilot.steps(arms, which, targets[which])
         if self._gain is not None:
             arms.speed = limit_acceleration(self._follower, self._gain, arms.q, arms.speed, q, goals)
             q = arms.q + arms.speed
-        arms.q = q
-        arms.look(self._follower)
+            points = torch.full_like(points, torch.nan)
+        arms.q, arms.p = q, points
+        unknown = points.isnan().any(1).nonzero()[:, 0]
+        if len(unknown):
+            arms.look(self._follower, unknown)
         return Command(q.reshape(*self._batch, -1).clone(), STATUSES[codes.numpy()].reshape(self._batch))
 
     def _start(self, batch: torch.Size, targets: Tensor) -> None:

@@ -68,10 +68,10 @@ def is_continuous(
         raise ParameterError("points and configurations", shapes, "equal batch shapes")
     if not bool(q[0].isfinite().all() & q[1].isfinite().all()):
         raise ParameterError("configurations", "NaN or infinite values", "finite values")
-    return _check(robot, task, p, q, c, epsilon, tolerances).reshape(batch)
+    return continuous_columns(robot, task, p, q, c, epsilon, tolerances).reshape(batch)
 
 
-def _check(
+def continuous_columns(
     robot: Robot,
     task: TaskSpace,
     p: tuple[Tensor, Tensor],
