@@ -14,9 +14,10 @@ from grr_torch.errors import ParameterError, SeedError
 from grr_torch.projection.columns import null_space_projector
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.auto_seeds import find_seeds
-from grr_torch.resolution.build import check_edges
+from grr_torch.resolution.edges import check_edges
 from grr_torch.resolution.random_grr import random_grr
-from grr_torch.resolution.refine import refine, summary
+from grr_torch.resolution.refine import refine
+from grr_torch.resolution.report import summary
 from grr_torch.spaces.graph import Copies, staggered_grid
 
 PROBLEMS = [("planar_5", "position", 400), ("planar_5", "fixed-rotation", 400), ("kinova", "fixed-rotation", 1500)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
-from grr_torch.resolution.build import check_edges
+from grr_torch.resolution.edges import check_edges
 from grr_torch.resolution.quality import quality_differences
 from grr_torch.resolution.roadmap_file import load_roadmap, metadata_hash, read_file, tensors_hash
 
