@@ -17,7 +17,7 @@ from grr_torch.errors import SeedError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.expand import grow
-from grr_torch.resolution.reachability import within_reach
+from grr_torch.resolution.reachability import from_random_starts, within_reach
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance, wrap
@@ -123,11 +123,8 @@ def _medoids(
     """
     inside = within_reach(robot, task, graph.points).nonzero()[:, 0]
     chosen = inside[torch.randperm(len(inside), generator=generator)[: 4 * _ANCHORS]]
-    guesses = robot.sample(len(chosen) * _STARTS, generator)
-    targets = graph.points[chosen].repeat_interleave(_STARTS, dim=0).to(guesses)
-    solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
-    configurations = solved.T.reshape(len(chosen), _STARTS, robot.n)
-    valid = valid.reshape(len(chosen), _STARTS)
+    configurations, valid = from_random_starts(robot, task, graph.points[chosen], _STARTS, generator, tolerances)
+    configurations = configurations.to(robot.device)
     # where most starts succeed the arm has room
     best = valid.sum(1).argsort(descending=True, stable=True)[:_ANCHORS].tolist()
     points: list[Tensor] = []
