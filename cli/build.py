@@ -24,6 +24,9 @@ def build(
             help="preset, auto (found), or a .csv, .txt or .npy FILE, one seed a row; preset if there is one."
         ),
     ] = None,
+    candidates: Annotated[
+        int | None, typer.Option(help="Sets of seeds that are compared where seeds are found; more may do better.")
+    ] = None,
     method: Annotated[str, typer.Option(help="expansion, or random: the baseline, in minutes.")] = "expansion",
     samples: Annotated[int, typer.Option(help="Random configurations of a vertex, for --method random.")] = 100,
     out: Annotated[Path | None, typer.Option(help="Roadmap file; by default ROBOT.grr. Replaced if it exists.")] = None,
@@ -72,6 +75,7 @@ def build(
     --bounds -0.8 0.8 -0.8 0.8 0 1.2 --seeds seeds.csv
     """
     from grr_torch.output import atomic_write, check_writable
+    from grr_torch.resolution.auto_seeds import CANDIDATES
     from grr_torch.resolution.build import build as build_roadmap
     from grr_torch.resolution.report import summary, traded
     from grr_torch.robots.load import load_robot
@@ -104,6 +108,7 @@ def build(
             points=points,
             bounds=box,
             seeds=_seeds(arm, seeds),
+            candidates=CANDIDATES if candidates is None else candidates,
             method=method,
             samples=samples,
             neighbours=neighbours,
@@ -113,6 +118,7 @@ def build(
             seed=seed,
             progress=progress,
         )
+        figures = roadmap.quality(progress)
         progress("writing", 0, 2)
         # both files appear together, or neither does
         with ExitStack() as stack:
@@ -123,7 +129,6 @@ def build(
 
                 record_roadmap(roadmap, stack.enter_context(atomic_write(recording)))
         progress("writing", 2, 2)
-    figures = roadmap.quality()
     quality = figures.to_dict()
     if as_json:
         files = {"out": str(out), "record": None if recording is None else str(recording)}

@@ -14,9 +14,10 @@ import grr_torch
 from grr_torch.errors import ParameterError, SeedError
 from grr_torch.projection.columns import null_space_projector
 from grr_torch.projection.project import Tolerances
-from grr_torch.resolution.auto_seeds import find_seeds
+from grr_torch.resolution.auto_seeds import _costs, _relaxed, find_seeds
 from grr_torch.resolution.constraints import Constraints
 from grr_torch.resolution.edges import check_edges
+from grr_torch.resolution.expand import expand
 from grr_torch.resolution.random_grr import random_grr
 from grr_torch.resolution.refine import refine
 from grr_torch.resolution.report import summary
@@ -86,6 +87,31 @@ def test_seeds_are_found_that_do_nearly_as_well_as_the_paper_s(name, task):
     assert found.resolved_vertices >= 0.99 * by_hand.resolved_vertices
     assert found.connected_edges >= 0.97 * by_hand.connected_edges
     assert found.smoothness <= 1.1 * by_hand.smoothness
+
+
+def test_copies_are_relaxed_as_if_each_were_alone(planar_5):
+    task = grr_torch.Position(2)
+    graph = staggered_grid([(-0.3, 0.3)] * 2, 40)
+    seeds = torch.tensor([[0.3, 0.5, 0.5, 0.5, 0.5], [2.0, -1.0, 0.4, -0.9, 0.3]], dtype=torch.float64)
+    maps = torch.stack([expand(planar_5, task, graph, seed[None]).configurations for seed in seeds])
+    assert bool(maps.isfinite().all())
+    together = _relaxed(planar_5, task, graph, maps, Tolerances(), 8)
+    for plain, moved in zip(maps, together, strict=True):
+        alone = _relaxed(planar_5, task, graph, plain[None], Tolerances(), 8)[0]
+        costs = [float(_costs(planar_5, task, graph, q[None])) for q in (plain, moved, alone)]
+        assert costs[1] < costs[0]
+        assert costs[1] == pytest.approx(costs[2], rel=0.02)
+
+
+@pytest.mark.parametrize("candidates", [0, -3, 1.5, True, 10**9])
+def test_candidates_are_a_whole_number(planar_5, candidates):
+    with pytest.raises(ParameterError, match="candidates"):
+        grr_torch.build(planar_5, "position", seeds="auto", candidates=candidates)
+
+
+def test_few_candidates_are_enough_for_some_map(planar_5):
+    roadmap = grr_torch.build(planar_5, "position", points=150, seeds="auto", candidates=1)
+    assert int(roadmap.resolved.sum()) > 100
 
 
 def test_an_arm_without_preset_needs_no_seeds(box_arm):

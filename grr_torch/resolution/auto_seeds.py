@@ -3,7 +3,8 @@
 A candidate starts from one configuration, a medoid of the self-motion manifold of some point, and is led once round
 the axis of the first joint. Turned rigidly with that joint and projected, a posture that the task allows all round
 closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph, the best of
-them relaxed there; the one with the smallest slopes, where what is missing counts as steep, seeds the roadmap.
+them relaxed there, and the best of those on the task graph itself; the one with the smallest slopes, where what is
+missing counts as steep, seeds the roadmap.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ import math
 import torch
 from torch import Tensor
 
-from grr_torch.errors import SeedError, check_seed
+from grr_torch.errors import ParameterError, SeedError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
-from grr_torch.resolution.expand import grow
+from grr_torch.resolution.expand import default_neighbours, grow
 from grr_torch.resolution.reachability import from_random_starts, within_reach
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.robots.robot import Robot
@@ -24,24 +25,30 @@ from grr_torch.spaces.configuration import distance, wrap
 from grr_torch.spaces.graph import Copies, TaskGraph, staggered_grid
 from grr_torch.spaces.task import TaskSpace
 
-# points whose self-motion manifolds are sampled, random starts of each, and medoids of each
-_ANCHORS = 10
-_STARTS = 64
+# candidates that are looked for, unless told otherwise
+CANDIDATES = 100
+_MOST_CANDIDATES = 10_000
+# of each point's self-motion manifold, random starts and medoids; each medoid gives two candidates
+_STARTS = 48
 _MEDOIDS = 3
+# points that are tried, as a multiple of those that are kept
+_TRIED = 3
 # seeds on a closed path
 _STATIONS = 12
 # vertices of the coarse graph, in the plane and in space
-_COARSE = {2: 400, 3: 1200}
-# candidates that are relaxed on it
-_RELAXED = 12
-# in so many rounds
-_ROUNDS = 10
+_COARSE = {2: 300, 3: 600}
 # vertices averaged over on it
 _NEIGHBOURS = 24
+# share of the candidates that are relaxed on it, and of those that are relaxed on the task graph itself
+_RELAXED = 0.1
+_FINALISTS = 0.04
+# in so many rounds each; these again in more, where more candidates are looked for
+_ROUNDS = 8
+_MOST_ROUNDS = 40
 # edges steeper than this many times the median are not relaxed
 _STEEP = 6.0
 # an edge that is missing, or steeper, counts as this many times the smallest median of slopes
-_MISSING = 15.0
+_MISSING = 40.0
 
 
 def find_seeds(
@@ -49,6 +56,7 @@ def find_seeds(
     task: TaskSpace,
     graph: TaskGraph,
     *,
+    candidates: int = CANDIDATES,
     seed: int = 0,
     tolerances: Tolerances,
     progress: Progress = silent,
@@ -58,24 +66,37 @@ def find_seeds(
     Args:
         robot: The robot.
         task: The task space.
-        graph: The task graph that will be expanded; a coarser one over its bounds is tried out.
+        graph: The task graph that will be expanded; a coarser one over its bounds is tried out first.
+        candidates: How many sets of seeds are compared; a tenth of them is relaxed on the coarse graph, and the best
+            of these again on the task graph itself.
         seed: Of all random draws.
         tolerances: Of the projections.
         progress: Told what is being done and how far it is.
 
     Raises:
+        ParameterError: `candidates` is out of its range.
         SeedError: No point of the graph is reached from random starts.
     """
+    if isinstance(candidates, bool) or not isinstance(candidates, int) or not 1 <= candidates <= _MOST_CANDIDATES:
+        raise ParameterError("candidates", candidates, f"a whole number from 1 to {_MOST_CANDIDATES:,}")
     generator = torch.Generator().manual_seed(check_seed(seed))
-    candidates = _closed_paths(robot, task, *_medoids(robot, task, graph, generator, tolerances), tolerances)
+    anchors = -(-candidates // (2 * _MEDOIDS))
+    medoids = _medoids(robot, task, graph, anchors, generator, tolerances)
+    paths = _closed_paths(robot, task, *medoids, tolerances)
     coarse = _coarse(graph, _COARSE[task.dimension])
-    progress("choosing seeds", 0, 2)
-    maps = _expansions(robot, task, coarse, candidates, tolerances)
-    progress("choosing seeds", 1, 2)
-    best = _costs(robot, task, coarse, maps).argsort(stable=True)[:_RELAXED].tolist()
-    relaxed = _relaxed(robot, task, coarse, maps[best], tolerances)
-    progress("choosing seeds", 2, 2)
-    return candidates[best[int(_costs(robot, task, coarse, relaxed).argmin())]]
+    progress("choosing seeds", 0, 3)
+    maps = _expansions(robot, task, coarse, paths, _NEIGHBOURS, tolerances)
+    progress("choosing seeds", 1, 3)
+    best = _costs(robot, task, coarse, maps).argsort(stable=True)[: math.ceil(_RELAXED * len(paths))].tolist()
+    relaxed = _relaxed(robot, task, coarse, maps[best], tolerances, _ROUNDS)
+    order = _costs(robot, task, coarse, relaxed).argsort(stable=True)[: math.ceil(_FINALISTS * len(paths))]
+    finalists = [paths[best[rank]] for rank in order.tolist()]
+    progress("choosing seeds", 2, 3)
+    maps = _expansions(robot, task, graph, finalists, default_neighbours(task), tolerances)
+    rounds = min(_MOST_ROUNDS, _ROUNDS * max(1, candidates // CANDIDATES))
+    relaxed = _relaxed(robot, task, graph, maps, tolerances, rounds)
+    progress("choosing seeds", 3, 3)
+    return finalists[int(_costs(robot, task, graph, relaxed).argmin())]
 
 
 def _coarse(graph: TaskGraph, points: int) -> TaskGraph:
@@ -88,7 +109,12 @@ def _coarse(graph: TaskGraph, points: int) -> TaskGraph:
 
 
 def _expansions(
-    robot: Robot, task: TaskSpace, graph: TaskGraph, candidates: list[Tensor], tolerances: Tolerances
+    robot: Robot,
+    task: TaskSpace,
+    graph: TaskGraph,
+    candidates: list[Tensor],
+    neighbours: int,
+    tolerances: Tolerances,
 ) -> Tensor:
     """(C, V, n) expansions of all candidates at once; NaN where unresolved."""
     size = len(graph.points)
@@ -107,14 +133,14 @@ def _expansions(
         Copies.of(graph, len(candidates)),
         vertices.to(seeds.device),
         solved.T[valid.to(seeds.device)][kept.to(seeds.device)],
-        neighbours=_NEIGHBOURS,
+        neighbours=neighbours,
         tolerances=tolerances,
     )
     return expansion.configurations.reshape(len(candidates), size, robot.n)
 
 
 def _medoids(
-    robot: Robot, task: TaskSpace, graph: TaskGraph, generator: torch.Generator, tolerances: Tolerances
+    robot: Robot, task: TaskSpace, graph: TaskGraph, anchors: int, generator: torch.Generator, tolerances: Tolerances
 ) -> tuple[Tensor, Tensor]:
     """Points (K, width) and at each a configuration (K, n) far from the others found there.
 
@@ -122,11 +148,11 @@ def _medoids(
         SeedError: No point was reached.
     """
     inside = within_reach(robot, task, graph.points).nonzero()[:, 0]
-    chosen = inside[torch.randperm(len(inside), generator=generator)[: 4 * _ANCHORS]]
+    chosen = inside[torch.randperm(len(inside), generator=generator)[: _TRIED * anchors]]
     configurations, valid = from_random_starts(robot, task, graph.points[chosen], _STARTS, generator, tolerances)
     configurations = configurations.to(robot.device)
     # where most starts succeed the arm has room
-    best = valid.sum(1).argsort(descending=True, stable=True)[:_ANCHORS].tolist()
+    best = valid.sum(1).argsort(descending=True, stable=True)[:anchors].tolist()
     points: list[Tensor] = []
     medoids: list[Tensor] = []
     for anchor in best:
@@ -198,7 +224,9 @@ def _costs(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Ten
     return torch.where(slopes.isnan(), limit, slopes.clamp(max=limit)).sum(1)
 
 
-def _relaxed(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tolerances: Tolerances) -> Tensor:
+def _relaxed(
+    robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tolerances: Tolerances, rounds: int
+) -> Tensor:
     """Maps (C, V, n), relaxed together over all edges between resolved vertices that are not steep."""
     copies = Copies.of(graph, len(maps))
     q = maps.reshape(-1, robot.n)
@@ -213,6 +241,7 @@ def _relaxed(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tole
     rank = torch.full((len(q),), -1, device=q.device)
     rank[vertices] = torch.arange(len(vertices), device=q.device)
     edges = torch.stack([rank[first[kept]], rank[second[kept]]])
-    network = Network(robot, task, points[vertices].T.contiguous(), edges, lengths[kept])
-    moved = relax(network, q[vertices].T.contiguous(), tolerances, silent, rounds=_ROUNDS)
+    owner = vertices // len(graph.points)
+    network = Network(robot, task, points[vertices].T.contiguous(), edges, lengths[kept], parts=owner)
+    moved = relax(network, q[vertices].T.contiguous(), tolerances, silent, rounds)
     return q.index_put((vertices,), moved.T).reshape(maps.shape)

@@ -13,7 +13,7 @@ from torch import Tensor
 from grr_torch.errors import ParameterError, UnknownNameError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
-from grr_torch.resolution.auto_seeds import find_seeds
+from grr_torch.resolution.auto_seeds import CANDIDATES, find_seeds
 from grr_torch.resolution.edges import continuous_edges
 from grr_torch.resolution.expand import default_neighbours, expand
 from grr_torch.resolution.objectives import check_objectives
@@ -38,6 +38,7 @@ def build(
     bounds: Bounds | None = None,
     seeds: SeedsLike | str | None = None,
     method: str = "expansion",
+    candidates: int = CANDIDATES,
     neighbours: int | None = None,
     samples: int = 100,
     refine: bool = True,
@@ -58,6 +59,7 @@ def build(
         points: How many vertices a staggered grid over `bounds` is asked for, or a task graph.
         bounds: (low, high) of each axis of the grid [m].
         seeds: (S, n) configurations that the expansion starts from, or "auto": they are found.
+        candidates: How many sets of seeds are compared, where they are found; more take longer and may do better.
         method: "expansion", or "random": random configurations at every vertex and a constraint solver.
         neighbours: How many of the nearest vertices are averaged over; 24 in the plane and 64 in space by default.
         samples: Random configurations of a vertex, for the method "random".
@@ -89,7 +91,8 @@ def build(
     if method == "random":
         parts = _at_random(robot, problem, samples, seed, tolerances, progress)
     else:
-        parts = _expanded(robot, problem, neighbours, seed, tolerances, progress)
+        problem = _with_seeds(robot, problem, candidates, seed, tolerances, progress)
+        parts = _expanded(robot, problem, neighbours, tolerances, progress)
     seconds = time.perf_counter() - begin
     settings = {"margin": robot.margin, "seed": seed, "reachability": reachability, "tolerances": asdict(tolerances)}
     roadmap = _assemble(robot, problem, parts, {"method": method, **parts.chosen, **settings}, seconds)
@@ -130,12 +133,22 @@ def _at_random(
     return _Parts(found.configurations, found.wave, found.connected, {"samples": samples, "seeds": []})
 
 
+def _with_seeds(
+    robot: Robot, problem: Problem, candidates: int, seed: int, tolerances: Tolerances, progress: Progress
+) -> Problem:
+    """The problem with seeds that are found, where none are given."""
+    task, graph, seeds = problem
+    if not isinstance(seeds, str):
+        return problem
+    found = find_seeds(robot, task, graph, candidates=candidates, seed=seed, tolerances=tolerances, progress=progress)
+    return Problem(task, graph, found)
+
+
 def _expanded(
-    robot: Robot, problem: Problem, neighbours: int | None, seed: int, tolerances: Tolerances, progress: Progress
+    robot: Robot, problem: Problem, neighbours: int | None, tolerances: Tolerances, progress: Progress
 ) -> _Parts:
     task, graph, table = problem
-    if isinstance(table, str):
-        table = find_seeds(robot, task, graph, seed=seed, tolerances=tolerances, progress=progress)
+    assert not isinstance(table, str)
     expansion = expand(robot, task, graph, table, neighbours=neighbours, tolerances=tolerances, progress=progress)
     found = expansion.configurations, expansion.resolved
     connected = continuous_edges(robot, task, graph.points, *found, graph.edges, tolerances, progress)

@@ -51,7 +51,7 @@ def refine(
         ParameterError: A weight is not valid, or the robot has no such objective.
     """
     weights = check_objectives(roadmap.robot, objectives)
-    before = roadmap.quality()
+    before = roadmap.quality(progress)
     begin = time.perf_counter()
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
     smoothest = _relaxed(repair(roadmap, tolerances, seed, progress), {}, tolerances, progress)

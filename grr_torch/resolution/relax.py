@@ -84,6 +84,8 @@ class Network:
         edges: (2, E) vertices of each edge.
         lengths: (E,) D_p of each edge.
         objectives: What else counts.
+        parts: (V,) number of the map that a vertex belongs to, if there are several without edges between them: each is
+            then relaxed as if it were alone.
     """
 
     robot: Robot
@@ -92,6 +94,7 @@ class Network:
     edges: Tensor
     lengths: Tensor
     objectives: tuple[Objective, ...] = ()
+    parts: Tensor | None = None
 
     @cached_property
     def incidence(self) -> _Incidence:
@@ -103,11 +106,12 @@ class Network:
         first, second = self.edges
         return difference(q[:, first], q[:, second], self.robot.continuous[:, None])
 
-    def cost(self, q: Tensor) -> float:
-        """Sum of D_q / D_p, rounded off at zero, and of the objectives' costs, for configurations (n, V)."""
-        squared = self.motions(q).square().sum(0)
-        slopes = float(((squared + _SHORTEST**2).sqrt() / self.lengths).sum())
-        return slopes + sum(objective.cost(q) for objective in self.objectives)
+    def costs(self, q: Tensor) -> Tensor:
+        """(P,) sums of D_q / D_p, rounded off at zero, by part, and of the objectives' costs, for (n, V)."""
+        slopes = (self.motions(q).square().sum(0) + _SHORTEST**2).sqrt() / self.lengths
+        if self.parts is not None:
+            return self.parts[self.edges[0]].bincount(slopes, minlength=int(self.parts.max()) + 1)
+        return slopes.sum()[None] + sum(objective.cost(q) for objective in self.objectives)
 
 
 class Pulls(NamedTuple):
@@ -126,27 +130,30 @@ class Pulls(NamedTuple):
 
 def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progress, rounds: int = _ROUNDS) -> Tensor:
     """Configurations (n, V) of lower cost: converged, within limits and free of self-collision like those given."""
-    damping, cost = 1e-2, network.cost(q)
+    parts = network.parts if network.parts is not None else torch.zeros_like(network.targets[0], dtype=torch.long)
+    costs = network.costs(q)
+    damping = torch.full_like(costs, 1e-2)
+    going_on = torch.ones_like(costs, dtype=torch.bool)
     with one_thread(), torch.no_grad():
         for done in range(rounds):
             progress("refining", done, rounds)
-            moved = move(network, q, gauss_newton_step(network, q, damping), tolerances)
-            new_cost = network.cost(moved)
-            if new_cost < cost:
-                gain = 1.0 - new_cost / cost
-                q, cost, damping = moved, new_cost, max(0.3 * damping, 1e-4)
-                if gain < _LEAST_GAIN:
-                    break
-            else:
-                damping *= 10.0
-                if damping > 1e3:
-                    break
+            moved = move(network, q, gauss_newton_step(network, q, damping[parts]), tolerances)
+            new_costs = network.costs(moved)
+            better = going_on & (new_costs < costs)
+            going_on = torch.where(better, new_costs < (1.0 - _LEAST_GAIN) * costs, going_on & (damping <= 1e2))
+            q, costs = torch.where(better[parts], moved, q), torch.where(better, new_costs, costs)
+            damping = torch.where(better, (0.3 * damping).clamp_min(1e-4), 10.0 * damping)
+            if not bool(going_on.any()):
+                break
     progress("refining", rounds, rounds)
     return q
 
 
-def gauss_newton_step(network: Network, q: Tensor, damping: float, pulls: Pulls | None = None) -> Tensor:
-    """A step (n, V) that lowers slopes, pulls and the objectives' costs, by preconditioned conjugate gradients."""
+def gauss_newton_step(network: Network, q: Tensor, damping: float | Tensor, pulls: Pulls | None = None) -> Tensor:
+    """A step (n, V) that lowers slopes, pulls and the objectives' costs, by preconditioned conjugate gradients.
+
+    The damping may be one for each vertex (V,).
+    """
     robot = network.robot
     motions = network.motions(q)
     weights = 1.0 / ((motions.square().sum(0) + _SHORTEST**2).sqrt() * network.lengths)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
+from grr_torch.progress import Progress, silent
 from grr_torch.resolution.cells import Cells, measure_cells, squares, triangles
 from grr_torch.resolution.quality import Quality, measure_quality
 from grr_torch.robots.robot import Robot
@@ -63,22 +64,30 @@ class Roadmap:
         """The task graph G_p."""
         return TaskGraph(self.points, self.edges, find_lattice(self.points))
 
-    def quality(self) -> Quality:
-        """Connectivity, smoothness, coverage, cells and residuals, computed once from the tensors."""
-        return self._quality
+    def quality(self, progress: Progress = silent) -> Quality:
+        """Connectivity, smoothness, coverage, cells and residuals, computed once from the tensors.
 
-    def cells(self) -> tuple[Cells, Cells]:
-        """The triangles of the roadmap, and in R³ the faces of its grid's cells, with their winding and spread."""
-        return self._cells
+        Args:
+            progress: Told how many cells are measured.
+        """
+        if "quality" not in self._measured:
+            self._measured["quality"] = measure_quality(self, progress)
+        return self._measured["quality"]
+
+    def cells(self, progress: Progress = silent) -> tuple[Cells, Cells]:
+        """The triangles of the roadmap, and in R³ the faces of its grid's cells, with their winding and spread.
+
+        Args:
+            progress: Told how many cells are measured.
+        """
+        if "cells" not in self._measured:
+            corners = triangles(self.edges[self.connected], len(self.points)), squares(self)
+            self._measured["cells"] = tuple(measure_cells(self, part, progress) for part in corners)
+        return self._measured["cells"]
 
     @cached_property
-    def _quality(self) -> Quality:
-        return measure_quality(self)
-
-    @cached_property
-    def _cells(self) -> tuple[Cells, Cells]:
-        corners = triangles(self.edges[self.connected], len(self.points)), squares(self)
-        return measure_cells(self, corners[0]), measure_cells(self, corners[1])
+    def _measured(self) -> dict[str, Any]:
+        return {}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the roadmap to one safetensors file (`.grr`), by an atomic rename.

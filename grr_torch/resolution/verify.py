@@ -36,14 +36,14 @@ def verify_file(path: str | os.PathLike[str], *, progress: Progress = silent) ->
 
     Args:
         path: The file.
-        progress: Told how many edges are checked.
+        progress: Told how many cells and edges are checked.
 
     Raises:
         FileFormatError: The file cannot be loaded at all.
     """
     metadata, tensors = read_file(path)
     roadmap = load_roadmap(path)
-    quality = roadmap.quality()
+    quality = roadmap.quality(progress)
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
     robot = metadata["robot"]
     stored_hash, found_hash = str(metadata.get("tensors_sha256")), tensors_hash(tensors)
