@@ -146,7 +146,7 @@ def trade(
             _number(row.quality.smoothness, 3),
             f"{row.quality.connected_edges:,}",
             _share(row.quality.triangles_certified),
-            *(f"{_figure(row.values[name]['mean'])}, {_figure(row.values[name]['worst'])}" for name in names),
+            *(f"{row.values[name]['mean']:.4g}, {row.values[name]['worst']:.3g}" for name in names),
         ]
         for row in trades
     ]

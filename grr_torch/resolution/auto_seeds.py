@@ -3,8 +3,8 @@
 A candidate starts from one configuration, a medoid of the self-motion manifold of some point, and is led once round
 the axis of the first joint. Turned rigidly with that joint and projected, a posture that the task allows all round
 closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph, the best of
-them relaxed there, and the best of those on the task graph itself; the one with the smallest slopes, where what is
-missing counts as steep, seeds the roadmap.
+them relaxed there and, if many are asked for, on the task graph itself; the one with the smallest slopes, where what
+is missing counts as steep, seeds the roadmap.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from grr_torch.spaces.graph import Copies, TaskGraph, staggered_grid
 from grr_torch.spaces.task import TaskSpace
 
 # candidates that are looked for, unless told otherwise
-CANDIDATES = 100
+CANDIDATES = 120
 _MOST_CANDIDATES = 10_000
 # of each point's self-motion manifold, random starts and medoids; each medoid gives two candidates
 _STARTS = 48
@@ -35,16 +35,16 @@ _MEDOIDS = 3
 _TRIED = 3
 # seeds on a closed path
 _STATIONS = 12
-# vertices of the coarse graph, in the plane and in space
-_COARSE = {2: 300, 3: 600}
+# vertices of the coarse graph that the arm should reach, in the plane and in space
+_COARSE = {2: 300, 3: 300}
 # vertices averaged over on it
 _NEIGHBOURS = 24
 # share of the candidates that are relaxed on it, and of those that are relaxed on the task graph itself
-_RELAXED = 0.1
+_RELAXED = 0.08
 _FINALISTS = 0.04
-# in so many rounds each; these again in more, where more candidates are looked for
-_ROUNDS = 8
-_MOST_ROUNDS = 40
+# in so many rounds each
+_ROUNDS = 10
+_FINAL_ROUNDS = 40
 # edges steeper than this many times the median are not relaxed
 _STEEP = 6.0
 # an edge that is missing, or steeper, counts as this many times the smallest median of slopes
@@ -67,8 +67,8 @@ def find_seeds(
         robot: The robot.
         task: The task space.
         graph: The task graph that will be expanded; a coarser one over its bounds is tried out first.
-        candidates: How many sets of seeds are compared; a tenth of them is relaxed on the coarse graph, and the best
-            of these again on the task graph itself.
+        candidates: How many sets of seeds are compared; of more than the default, the best are compared again on the
+            task graph itself, which takes far longer.
         seed: Of all random draws.
         tolerances: Of the projections.
         progress: Told what is being done and how far it is.
@@ -81,20 +81,22 @@ def find_seeds(
         raise ParameterError("candidates", candidates, f"a whole number from 1 to {_MOST_CANDIDATES:,}")
     generator = torch.Generator().manual_seed(check_seed(seed))
     anchors = -(-candidates // (2 * _MEDOIDS))
-    medoids = _medoids(robot, task, graph, anchors, generator, tolerances)
-    paths = _closed_paths(robot, task, *medoids, tolerances)
-    coarse = _coarse(graph, _COARSE[task.dimension])
+    points, medoids, share = _medoids(robot, task, graph, anchors, generator, tolerances)
+    paths = _closed_paths(robot, task, points, medoids, tolerances)
+    coarse = _coarse(graph, math.ceil(_COARSE[task.dimension] / share))
     progress("choosing seeds", 0, 3)
     maps = _expansions(robot, task, coarse, paths, _NEIGHBOURS, tolerances)
     progress("choosing seeds", 1, 3)
     best = _costs(robot, task, coarse, maps).argsort(stable=True)[: math.ceil(_RELAXED * len(paths))].tolist()
     relaxed = _relaxed(robot, task, coarse, maps[best], tolerances, _ROUNDS)
-    order = _costs(robot, task, coarse, relaxed).argsort(stable=True)[: math.ceil(_FINALISTS * len(paths))]
+    order = _costs(robot, task, coarse, relaxed).argsort(stable=True)
     finalists = [paths[best[rank]] for rank in order.tolist()]
     progress("choosing seeds", 2, 3)
+    if candidates <= CANDIDATES:
+        return finalists[0]
+    finalists = finalists[: math.ceil(_FINALISTS * len(paths))]
     maps = _expansions(robot, task, graph, finalists, default_neighbours(task), tolerances)
-    rounds = min(_MOST_ROUNDS, _ROUNDS * max(1, candidates // CANDIDATES))
-    relaxed = _relaxed(robot, task, graph, maps, tolerances, rounds)
+    relaxed = _relaxed(robot, task, graph, maps, tolerances, _FINAL_ROUNDS)
     progress("choosing seeds", 3, 3)
     return finalists[int(_costs(robot, task, graph, relaxed).argmin())]
 
@@ -141,8 +143,8 @@ def _expansions(
 
 def _medoids(
     robot: Robot, task: TaskSpace, graph: TaskGraph, anchors: int, generator: torch.Generator, tolerances: Tolerances
-) -> tuple[Tensor, Tensor]:
-    """Points (K, width) and at each a configuration (K, n) far from the others found there.
+) -> tuple[Tensor, Tensor, float]:
+    """Points (K, width), at each a configuration (K, n) far from others found there, and what share was reached.
 
     Raises:
         SeedError: No point was reached.
@@ -167,7 +169,8 @@ def _medoids(
         points.append(graph.points[chosen[anchor]].to(found).expand(len(picked), -1))
     if not medoids:
         raise SeedError(f"no seeds were found: none of {len(chosen)} points was reached from {_STARTS} random starts")
-    return torch.cat(points), torch.cat(medoids)
+    share = len(inside) / len(graph.points) * float(valid.any(1).double().mean())
+    return torch.cat(points), torch.cat(medoids), share
 
 
 def _closed_paths(
