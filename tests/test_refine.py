@@ -221,3 +221,14 @@ def test_a_flat_graph_in_space_needs_no_seeds(kinova):
     points = torch.cat([sheet.points, torch.full((len(sheet.points), 1), 0.4, dtype=torch.float64)], dim=1)
     graph = grr_torch.TaskGraph(points, sheet.edges)
     assert int(grr_torch.build(kinova, "position", points=graph, seeds="auto").resolved.sum()) > 50
+
+
+def test_progress_counts_what_is_done(kinova):
+    told: dict[str, list[tuple[int, int]]] = {}
+    plain = grr_torch.build(kinova, "position", points=500, refine=False)
+    refine(plain, progress=lambda stage, done, total: told.setdefault(stage, []).append((done, total)))
+    assert set(told) == {"repairing", "refining", "certifying", "checking edges", "measuring cells"}
+    assert all(0 <= done <= total for calls in told.values() for done, total in calls)
+    assert all(calls[-1][0] == calls[-1][1] for calls in told.values())
+    cells = plain.cells()
+    assert {(len(part.corners),) * 2 for part in cells} <= set(told["measuring cells"])
