@@ -111,27 +111,72 @@ def roadmap(
     typer.echo(markdown_table(head, [_roadmap_row(result) for result in results]))
 
 
+@app.command()
+@reports_errors
+def trade(
+    robot: Annotated[str, typer.Option(help="A bundled robot.")] = "kinova",
+    task: Annotated[str | None, typer.Option(help="position or fixed-rotation; the preset's default.")] = None,
+    objective: Annotated[
+        list[str] | None, typer.Option(help="clearance, manipulability or limits; repeatable; by default all.")
+    ] = None,
+    weight: Annotated[list[float] | None, typer.Option(help="Repeatable; by default 0.1, 0.3, 1 and 3.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+) -> None:
+    """Print what secondary objectives cost in smoothness, as a Markdown table.
+
+    Example: grr-torch bench trade --robot kinova --objective clearance --weight 0.3 --weight 1
+    """
+    from grr_torch.experiments.trade import WEIGHTS, measure_trade
+    from grr_torch.output import atomic_write, check_writable
+
+    if json_file is not None:
+        check_writable(json_file)
+    with progress_bar() as progress:
+        trades = measure_trade(
+            robot, task, objectives=objective, weights=weight or WEIGHTS, seed=seed, progress=progress
+        )
+    if json_file is not None:
+        with atomic_write(json_file) as path:
+            path.write_text(json.dumps([row.to_dict() for row in trades], indent=2), encoding="utf-8")
+    names = list(trades[0].values)
+    head = ["objective", "weight", "smoothness", "connected", "certified", *(f"{name}: mean, worst" for name in names)]
+    rows = [
+        [
+            row.objective or "none",
+            f"{row.weight:g}",
+            _number(row.quality.smoothness, 3),
+            f"{row.quality.connected_edges:,}",
+            _share(row.quality.triangles_certified),
+            *(f"{row.values[name]['mean']:.4g}, {row.values[name]['worst']:.3g}" for name in names),
+        ]
+        for row in trades
+    ]
+    typer.echo(markdown_table(head, rows))
+
+
 def _roadmap_row(result: Result) -> list[str]:
     quality, paper = result.quality, result.paper
-
-    def share(value: float | None) -> str:
-        return "" if value is None else f"{100.0 * value:.2f} %"
-
-    def number(value: float | None, digits: int) -> str:
-        return "none" if value is None else f"{value:.{digits}f}"
-
     return [
         f"{result.robot} {result.task}",
         f"{result.method}{', refined' if result.refined else ''}",
         f"{quality.resolved_vertices:,} / {quality.reachable_vertices:,}",
-        f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({share(quality.connectivity)})",
-        number(quality.smoothness, 3),
-        f"{number(quality.smoothness_p99, 1)}, {number(quality.smoothness_max, 1)}",
-        share(quality.triangles_certified),
-        share(quality.squares_certified),
+        f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({_share(quality.connectivity)})",
+        _number(quality.smoothness, 3),
+        f"{_number(quality.smoothness_p99, 1)}, {_number(quality.smoothness_max, 1)}",
+        _share(quality.triangles_certified),
+        _share(quality.squares_certified),
         f"{result.seconds:.2f}",
         "" if paper is None else f"{paper[0]} %, {paper[1]}, {60.0 * paper[2]:.0f} s",
     ]
+
+
+def _share(value: float | None) -> str:
+    return "" if value is None else f"{100.0 * value:.2f} %"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "none" if value is None else f"{value:.{digits}f}"
 
 
 def _show_speed(table: SpeedTable) -> None:

@@ -24,6 +24,9 @@ def build(
             help="preset, auto (found), or a .csv, .txt or .npy FILE, one seed a row; preset if there is one."
         ),
     ] = None,
+    candidates: Annotated[
+        int | None, typer.Option(help="Sets of seeds that are compared where seeds are found; more may do better.")
+    ] = None,
     method: Annotated[str, typer.Option(help="expansion, or random: the baseline, in minutes.")] = "expansion",
     samples: Annotated[int, typer.Option(help="Random configurations of a vertex, for --method random.")] = 100,
     out: Annotated[Path | None, typer.Option(help="Roadmap file; by default ROBOT.grr. Replaced if it exists.")] = None,
@@ -32,6 +35,14 @@ def build(
     refine: Annotated[
         bool, typer.Option("--refine/--no-refine", help="Repair, relax and certify the roadmap after the expansion.")
     ] = True,
+    objective: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="clearance, manipulability or limits: what refinement serves besides smoothness; repeatable. "
+            "At weight 1, 1 % of its mean is worth 1 % of smoothness; at 0 it is only reported.",
+            metavar="NAME=WEIGHT",
+        ),
+    ] = None,
     reachability: Annotated[
         int, typer.Option(help="Random starts per unresolved vertex, to tell which are reachable; 0: not measured.")
     ] = 0,
@@ -58,14 +69,15 @@ def build(
 ) -> None:
     """Build a roadmap, print its quality, and write it with a recording of it.
 
-    Example: grr-torch build --robot kinova
+    Example: grr-torch build --robot kinova --objective clearance=0.5 --objective limits=0.1
 
     Example: grr-torch build --robot arm.urdf --tool flange --task position --points 2000
     --bounds -0.8 0.8 -0.8 0.8 0 1.2 --seeds seeds.csv
     """
     from grr_torch.output import atomic_write, check_writable
+    from grr_torch.resolution.auto_seeds import CANDIDATES
     from grr_torch.resolution.build import build as build_roadmap
-    from grr_torch.resolution.refine import summary as refinement
+    from grr_torch.resolution.report import summary, traded
     from grr_torch.robots.load import load_robot
 
     with progress_bar() as progress:
@@ -96,14 +108,17 @@ def build(
             points=points,
             bounds=box,
             seeds=_seeds(arm, seeds),
+            candidates=CANDIDATES if candidates is None else candidates,
             method=method,
             samples=samples,
             neighbours=neighbours,
             refine=refine,
+            objectives=_weights(objective or []),
             reachability=reachability,
             seed=seed,
             progress=progress,
         )
+        figures = roadmap.quality(progress)
         progress("writing", 0, 2)
         # both files appear together, or neither does
         with ExitStack() as stack:
@@ -114,19 +129,20 @@ def build(
 
                 record_roadmap(roadmap, stack.enter_context(atomic_write(recording)))
         progress("writing", 2, 2)
-    figures = roadmap.quality()
     quality = figures.to_dict()
     if as_json:
         files = {"out": str(out), "record": None if recording is None else str(recording)}
-        print_json({**quality, "build_seconds": roadmap.build_seconds, **files})
+        told = {"refinement": roadmap.parameters.get("refinement")}
+        print_json({**quality, "build_seconds": roadmap.build_seconds, **told, **files})
         return
     rotation = roadmap.task.to_json().get("rotation")
     turned = "" if rotation is None else f", roll pitch yaw {' '.join(f'{angle:.4g}' for angle in rotation)} rad"
     title = f"{arm.name}, {roadmap.task.kind} in {roadmap.task.name}{turned}"
     written = str(out) if recording is None else f"{out}, {recording} (grr-torch view {out})"
-    change = refinement(roadmap, figures)
+    change = summary(roadmap, figures)
     rows = [
         *([("refined", change)] if change else []),
+        *traded(roadmap, figures).items(),
         ("built in", f"{roadmap.build_seconds:.2f} s (the algorithm alone)"),
         ("written", written),
     ]
@@ -183,14 +199,22 @@ def _bounds(text: str) -> list[tuple[float, float]]:
     return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
+def _weights(items: list[str]) -> dict[str, float]:
+    return _named_numbers("--objective", items, "NAME=WEIGHT, a number of 0 or more")
+
+
 def _held(items: list[str]) -> dict[str, float]:
-    held: dict[str, float] = {}
+    return _named_numbers("--hold", items, "JOINT=VALUE, the value in radians or metres")
+
+
+def _named_numbers(option: str, items: list[str], valid: str) -> dict[str, float]:
+    numbers: dict[str, float] = {}
     for item in items:
         name, _, value = item.partition("=")
-        if name in held:
-            raise ParameterError("--hold", repr(item), f"one value for '{name}'")
+        if name in numbers:
+            raise ParameterError(option, repr(item), f"one value for '{name}'")
         try:
-            held[name] = float(value)
+            numbers[name] = float(value)
         except ValueError as error:
-            raise ParameterError("--hold", repr(item), "JOINT=VALUE, the value in radians or metres") from error
-    return held
+            raise ParameterError(option, repr(item), valid) from error
+    return numbers

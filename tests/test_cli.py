@@ -56,7 +56,7 @@ def test_build_writes_a_roadmap_and_a_recording_and_prints_one_object(built):
     folder, result = built
     assert result.returncode == 0, result.stderr
     data = json.loads(result.stdout)
-    assert set(data) == QUALITY | {"build_seconds", "out", "record"}
+    assert set(data) == QUALITY | {"build_seconds", "refinement", "out", "record"}
     assert (data["out"], data["record"]) == ("planar_5.grr", "planar_5.rrd")
     assert sorted(path.name for path in folder.iterdir()) == ["planar_5.grr", "planar_5.rrd"]
     stored = grr_torch.Roadmap.load(folder / "planar_5.grr").quality().to_dict()

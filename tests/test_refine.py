@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from public_arms import IIWA_14, PANDA, PLANAR_10, arm_urdf
@@ -13,10 +14,13 @@ import grr_torch
 from grr_torch.errors import ParameterError, SeedError
 from grr_torch.projection.columns import null_space_projector
 from grr_torch.projection.project import Tolerances
-from grr_torch.resolution.auto_seeds import find_seeds
-from grr_torch.resolution.build import check_edges
+from grr_torch.resolution.auto_seeds import _costs, _relaxed, find_seeds
+from grr_torch.resolution.constraints import Constraints
+from grr_torch.resolution.edges import check_edges
+from grr_torch.resolution.expand import expand
 from grr_torch.resolution.random_grr import random_grr
-from grr_torch.resolution.refine import refine, summary
+from grr_torch.resolution.refine import refine
+from grr_torch.resolution.report import summary
 from grr_torch.spaces.graph import Copies, staggered_grid
 
 PROBLEMS = [("planar_5", "position", 400), ("planar_5", "fixed-rotation", 400), ("kinova", "fixed-rotation", 1500)]
@@ -85,6 +89,31 @@ def test_seeds_are_found_that_do_nearly_as_well_as_the_paper_s(name, task):
     assert found.smoothness <= 1.1 * by_hand.smoothness
 
 
+def test_copies_are_relaxed_as_if_each_were_alone(planar_5):
+    task = grr_torch.Position(2)
+    graph = staggered_grid([(-0.3, 0.3)] * 2, 40)
+    seeds = torch.tensor([[0.3, 0.5, 0.5, 0.5, 0.5], [2.0, -1.0, 0.4, -0.9, 0.3]], dtype=torch.float64)
+    maps = torch.stack([expand(planar_5, task, graph, seed[None]).configurations for seed in seeds])
+    assert bool(maps.isfinite().all())
+    together = _relaxed(planar_5, task, graph, maps, Tolerances(), 8)
+    for plain, moved in zip(maps, together, strict=True):
+        alone = _relaxed(planar_5, task, graph, plain[None], Tolerances(), 8)[0]
+        costs = [float(_costs(planar_5, task, graph, q[None])) for q in (plain, moved, alone)]
+        assert costs[1] < costs[0]
+        assert costs[1] == pytest.approx(costs[2], rel=0.02)
+
+
+@pytest.mark.parametrize("candidates", [0, -3, 1.5, True, 10**9])
+def test_candidates_are_a_whole_number(planar_5, candidates):
+    with pytest.raises(ParameterError, match="candidates"):
+        grr_torch.build(planar_5, "position", seeds="auto", candidates=candidates)
+
+
+def test_few_candidates_are_enough_for_some_map(planar_5):
+    roadmap = grr_torch.build(planar_5, "position", points=150, seeds="auto", candidates=1)
+    assert int(roadmap.resolved.sum()) > 100
+
+
 def test_an_arm_without_preset_needs_no_seeds(box_arm):
     roadmap = grr_torch.build(
         grr_torch.load_robot(box_arm), "position", points=200, bounds=[(-0.6, 0.6)] * 2 + [(0.2, 1.0)]
@@ -135,10 +164,30 @@ def test_random_grr_resolves_the_disc_with_continuous_edges(planar_5):
     )
     quality = roadmap.quality()
     assert quality.coverage == 1.0
-    assert quality.connectivity > 0.9
+    assert quality.connectivity > 0.97
     assert torch.equal(check_edges(roadmap, Tolerances())[roadmap.connected], roadmap.connected[roadmap.connected])
     # what is picked at random is steeper than what is expanded
     assert quality.smoothness > grr_torch.build(planar_5, "position", points=150).quality().smoothness
+
+
+def test_a_solvable_problem_is_solved_and_values_are_those_a_variable_has():
+    """A ring of variables with few compatible pairs, one assignment of which holds throughout."""
+    random = np.random.default_rng(0)
+    variables, values = 60, 12
+    counts = random.integers(6, values + 1, variables)
+    planted = random.integers(0, counts)
+    edges = np.array([(i, (i + step) % variables) for i in range(variables) for step in (1, 2)])
+    compatible = random.random((len(edges), values, values)) < 0.15
+    compatible[np.arange(len(edges)), planted[edges[:, 0]], planted[edges[:, 1]]] = True
+    problem = Constraints(edges, compatible, counts)
+    start = problem.grow(random)
+    found = max((problem.descend(start, random) for _ in range(3)), key=lambda values: problem.held(values).sum())
+    assert problem.held(found).mean() > 0.95
+    assert problem.held(found).sum() >= problem.held(start).sum()
+    assert bool((found < counts).all())
+    assert bool(problem.held(planted).all())
+    nothing = Constraints(edges, np.zeros_like(compatible), counts)
+    assert not nothing.held(nothing.descend(start, random)).any()
 
 
 @pytest.mark.parametrize("options", [{"samples": 0}, {"nearest": 0}, {"samples": 10**6}])
@@ -172,3 +221,14 @@ def test_a_flat_graph_in_space_needs_no_seeds(kinova):
     points = torch.cat([sheet.points, torch.full((len(sheet.points), 1), 0.4, dtype=torch.float64)], dim=1)
     graph = grr_torch.TaskGraph(points, sheet.edges)
     assert int(grr_torch.build(kinova, "position", points=graph, seeds="auto").resolved.sum()) > 50
+
+
+def test_progress_counts_what_is_done(kinova):
+    told: dict[str, list[tuple[int, int]]] = {}
+    plain = grr_torch.build(kinova, "position", points=500, refine=False)
+    refine(plain, progress=lambda stage, done, total: told.setdefault(stage, []).append((done, total)))
+    assert set(told) == {"repairing", "refining", "certifying", "checking edges", "measuring cells"}
+    assert all(0 <= done <= total for calls in told.values() for done, total in calls)
+    assert all(calls[-1][0] == calls[-1][1] for calls in told.values())
+    cells = plain.cells()
+    assert {(len(part.corners),) * 2 for part in cells} <= set(told["measuring cells"])

@@ -296,3 +296,17 @@ def test_bad_bounds_are_errors(bounds):
 def test_bad_counts_are_errors(n):
     with pytest.raises(ParameterError, match="points: got"):
         staggered_grid([(0, 1), (0, 1)], n)
+
+
+def test_around_and_edge_between_agree_with_the_edges(generator):
+    graph = random_graph([(0.0, 1.0)] * 2, 40, k=5, generator=generator)
+    vertices = torch.tensor([7, 0, 7, 39])
+    rank, others = graph.around(vertices)
+    for k, vertex in enumerate(vertices.tolist()):
+        touching = graph.edges[(graph.edges == vertex).any(1)]
+        expected = touching.sum(1) - vertex
+        assert sorted(others[rank == k].tolist()) == sorted(expected.tolist())
+    edges = graph.edge_between(vertices[rank], others)
+    assert torch.equal(graph.edges[edges], torch.stack([vertices[rank], others], dim=1).sort(dim=1).values)
+    nothing = graph.around(vertices[:0])
+    assert [len(part) for part in nothing] == [0, 0]

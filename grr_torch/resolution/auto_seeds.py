@@ -3,7 +3,8 @@
 A candidate starts from one configuration, a medoid of the self-motion manifold of some point, and is led once round
 the axis of the first joint. Turned rigidly with that joint and projected, a posture that the task allows all round
 closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph, the best of
-them relaxed there; the one with the smallest slopes, where what is missing counts as steep, seeds the roadmap.
+them relaxed there and, if many are asked for, on the task graph itself; the one with the smallest slopes, where what
+is missing counts as steep, seeds the roadmap.
 """
 
 from __future__ import annotations
@@ -13,35 +14,41 @@ import math
 import torch
 from torch import Tensor
 
-from grr_torch.errors import SeedError, check_seed
+from grr_torch.errors import ParameterError, SeedError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
-from grr_torch.resolution.expand import grow
-from grr_torch.resolution.reachability import within_reach
+from grr_torch.resolution.expand import default_neighbours, grow
+from grr_torch.resolution.reachability import from_random_starts, within_reach
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance, wrap
 from grr_torch.spaces.graph import Copies, TaskGraph, staggered_grid
 from grr_torch.spaces.task import TaskSpace
 
-# points whose self-motion manifolds are sampled, random starts of each, and medoids of each
-_ANCHORS = 10
-_STARTS = 64
+# candidates that are looked for, unless told otherwise
+CANDIDATES = 120
+_MOST_CANDIDATES = 10_000
+# of each point's self-motion manifold, random starts and medoids; each medoid gives two candidates
+_STARTS = 48
 _MEDOIDS = 3
+# points that are tried, as a multiple of those that are kept
+_TRIED = 3
 # seeds on a closed path
 _STATIONS = 12
-# vertices of the coarse graph, in the plane and in space
-_COARSE = {2: 400, 3: 1200}
-# candidates that are relaxed on it
-_RELAXED = 12
-# in so many rounds
-_ROUNDS = 10
+# vertices of the coarse graph that the arm should reach, in the plane and in space
+_COARSE = {2: 300, 3: 300}
 # vertices averaged over on it
 _NEIGHBOURS = 24
+# share of the candidates that are relaxed on it, and of those that are relaxed on the task graph itself
+_RELAXED = 0.08
+_FINALISTS = 0.04
+# in so many rounds each
+_ROUNDS = 10
+_FINAL_ROUNDS = 40
 # edges steeper than this many times the median are not relaxed
 _STEEP = 6.0
 # an edge that is missing, or steeper, counts as this many times the smallest median of slopes
-_MISSING = 15.0
+_MISSING = 40.0
 
 
 def find_seeds(
@@ -49,6 +56,7 @@ def find_seeds(
     task: TaskSpace,
     graph: TaskGraph,
     *,
+    candidates: int = CANDIDATES,
     seed: int = 0,
     tolerances: Tolerances,
     progress: Progress = silent,
@@ -58,24 +66,39 @@ def find_seeds(
     Args:
         robot: The robot.
         task: The task space.
-        graph: The task graph that will be expanded; a coarser one over its bounds is tried out.
+        graph: The task graph that will be expanded; a coarser one over its bounds is tried out first.
+        candidates: How many sets of seeds are compared; of more than the default, the best are compared again on the
+            task graph itself, which takes far longer.
         seed: Of all random draws.
         tolerances: Of the projections.
         progress: Told what is being done and how far it is.
 
     Raises:
+        ParameterError: `candidates` is out of its range.
         SeedError: No point of the graph is reached from random starts.
     """
+    if isinstance(candidates, bool) or not isinstance(candidates, int) or not 1 <= candidates <= _MOST_CANDIDATES:
+        raise ParameterError("candidates", candidates, f"a whole number from 1 to {_MOST_CANDIDATES:,}")
     generator = torch.Generator().manual_seed(check_seed(seed))
-    candidates = _closed_paths(robot, task, *_medoids(robot, task, graph, generator, tolerances), tolerances)
-    coarse = _coarse(graph, _COARSE[task.dimension])
-    progress("choosing seeds", 0, 2)
-    maps = _expansions(robot, task, coarse, candidates, tolerances)
-    progress("choosing seeds", 1, 2)
-    best = _costs(robot, task, coarse, maps).argsort(stable=True)[:_RELAXED].tolist()
-    relaxed = _relaxed(robot, task, coarse, maps[best], tolerances)
-    progress("choosing seeds", 2, 2)
-    return candidates[best[int(_costs(robot, task, coarse, relaxed).argmin())]]
+    anchors = -(-candidates // (2 * _MEDOIDS))
+    points, medoids, share = _medoids(robot, task, graph, anchors, generator, tolerances)
+    paths = _closed_paths(robot, task, points, medoids, tolerances)
+    coarse = _coarse(graph, math.ceil(_COARSE[task.dimension] / share))
+    progress("choosing seeds", 0, 3)
+    maps = _expansions(robot, task, coarse, paths, _NEIGHBOURS, tolerances)
+    progress("choosing seeds", 1, 3)
+    best = _costs(robot, task, coarse, maps).argsort(stable=True)[: math.ceil(_RELAXED * len(paths))].tolist()
+    relaxed = _relaxed(robot, task, coarse, maps[best], tolerances, _ROUNDS)
+    order = _costs(robot, task, coarse, relaxed).argsort(stable=True)
+    finalists = [paths[best[rank]] for rank in order.tolist()]
+    progress("choosing seeds", 2, 3)
+    if candidates <= CANDIDATES:
+        return finalists[0]
+    finalists = finalists[: math.ceil(_FINALISTS * len(paths))]
+    maps = _expansions(robot, task, graph, finalists, default_neighbours(task), tolerances)
+    relaxed = _relaxed(robot, task, graph, maps, tolerances, _FINAL_ROUNDS)
+    progress("choosing seeds", 3, 3)
+    return finalists[int(_costs(robot, task, graph, relaxed).argmin())]
 
 
 def _coarse(graph: TaskGraph, points: int) -> TaskGraph:
@@ -88,7 +111,12 @@ def _coarse(graph: TaskGraph, points: int) -> TaskGraph:
 
 
 def _expansions(
-    robot: Robot, task: TaskSpace, graph: TaskGraph, candidates: list[Tensor], tolerances: Tolerances
+    robot: Robot,
+    task: TaskSpace,
+    graph: TaskGraph,
+    candidates: list[Tensor],
+    neighbours: int,
+    tolerances: Tolerances,
 ) -> Tensor:
     """(C, V, n) expansions of all candidates at once; NaN where unresolved."""
     size = len(graph.points)
@@ -107,29 +135,26 @@ def _expansions(
         Copies.of(graph, len(candidates)),
         vertices.to(seeds.device),
         solved.T[valid.to(seeds.device)][kept.to(seeds.device)],
-        neighbours=_NEIGHBOURS,
+        neighbours=neighbours,
         tolerances=tolerances,
     )
     return expansion.configurations.reshape(len(candidates), size, robot.n)
 
 
 def _medoids(
-    robot: Robot, task: TaskSpace, graph: TaskGraph, generator: torch.Generator, tolerances: Tolerances
-) -> tuple[Tensor, Tensor]:
-    """Points (K, width) and at each a configuration (K, n) far from the others found there.
+    robot: Robot, task: TaskSpace, graph: TaskGraph, anchors: int, generator: torch.Generator, tolerances: Tolerances
+) -> tuple[Tensor, Tensor, float]:
+    """Points (K, width), at each a configuration (K, n) far from others found there, and what share was reached.
 
     Raises:
         SeedError: No point was reached.
     """
     inside = within_reach(robot, task, graph.points).nonzero()[:, 0]
-    chosen = inside[torch.randperm(len(inside), generator=generator)[: 4 * _ANCHORS]]
-    guesses = robot.sample(len(chosen) * _STARTS, generator)
-    targets = graph.points[chosen].repeat_interleave(_STARTS, dim=0).to(guesses)
-    solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
-    configurations = solved.T.reshape(len(chosen), _STARTS, robot.n)
-    valid = valid.reshape(len(chosen), _STARTS)
+    chosen = inside[torch.randperm(len(inside), generator=generator)[: _TRIED * anchors]]
+    configurations, valid = from_random_starts(robot, task, graph.points[chosen], _STARTS, generator, tolerances)
+    configurations = configurations.to(robot.device)
     # where most starts succeed the arm has room
-    best = valid.sum(1).argsort(descending=True, stable=True)[:_ANCHORS].tolist()
+    best = valid.sum(1).argsort(descending=True, stable=True)[:anchors].tolist()
     points: list[Tensor] = []
     medoids: list[Tensor] = []
     for anchor in best:
@@ -144,7 +169,8 @@ def _medoids(
         points.append(graph.points[chosen[anchor]].to(found).expand(len(picked), -1))
     if not medoids:
         raise SeedError(f"no seeds were found: none of {len(chosen)} points was reached from {_STARTS} random starts")
-    return torch.cat(points), torch.cat(medoids)
+    share = len(inside) / len(graph.points) * float(valid.any(1).double().mean())
+    return torch.cat(points), torch.cat(medoids), share
 
 
 def _closed_paths(
@@ -201,7 +227,9 @@ def _costs(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Ten
     return torch.where(slopes.isnan(), limit, slopes.clamp(max=limit)).sum(1)
 
 
-def _relaxed(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tolerances: Tolerances) -> Tensor:
+def _relaxed(
+    robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tolerances: Tolerances, rounds: int
+) -> Tensor:
     """Maps (C, V, n), relaxed together over all edges between resolved vertices that are not steep."""
     copies = Copies.of(graph, len(maps))
     q = maps.reshape(-1, robot.n)
@@ -216,6 +244,7 @@ def _relaxed(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tole
     rank = torch.full((len(q),), -1, device=q.device)
     rank[vertices] = torch.arange(len(vertices), device=q.device)
     edges = torch.stack([rank[first[kept]], rank[second[kept]]])
-    network = Network(robot, task, points[vertices].T.contiguous(), edges, lengths[kept])
-    moved = relax(network, q[vertices].T.contiguous(), tolerances, silent, rounds=_ROUNDS)
+    owner = vertices // len(graph.points)
+    network = Network(robot, task, points[vertices].T.contiguous(), edges, lengths[kept], parts=owner)
+    moved = relax(network, q[vertices].T.contiguous(), tolerances, silent, rounds)
     return q.index_put((vertices,), moved.T).reshape(maps.shape)

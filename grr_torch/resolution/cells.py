@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.spaces.configuration import difference, distance
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 LARGEST_SPREAD = 1.0
 # projections on the way from a corner to the centre
 _STEPS = 8
+_CELLS_AT_ONCE = 8192
 
 
 @dataclass(frozen=True)
@@ -63,13 +65,13 @@ class Cells:
         return ~self.wound & ~self.spread_out
 
 
-def measure_cells(roadmap: Roadmap, corners: Tensor) -> Cells:
+def measure_cells(roadmap: Roadmap, corners: Tensor, progress: Progress = silent) -> Cells:
     """Winding and spread of cells given by their corners (C, k)."""
     robot = roadmap.robot
     wraps = robot.continuous.cpu()
     q = roadmap.configurations[corners]
     turns = difference(q, q.roll(-1, dims=1), wraps).sum(1) / (2.0 * math.pi)
-    return Cells(corners, torch.where(wraps, turns.round(), 0.0).to(torch.int64), _spread(roadmap, corners))
+    return Cells(corners, torch.where(wraps, turns.round(), 0.0).to(torch.int64), _spread(roadmap, corners, progress))
 
 
 def triangles(edges: Tensor, vertices: int) -> Tensor:
@@ -109,7 +111,7 @@ def _are_edges(keys: Tensor, wanted: Tensor) -> Tensor:
 
 
 def lead_to_centres(
-    robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances
+    robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress = silent
 ) -> tuple[Tensor, Tensor]:
     """Follows the straight lines from the corners of cells to their centres.
 
@@ -119,10 +121,22 @@ def lead_to_centres(
         points: (C, k, width) corners.
         q: (C, k, n) configurations there.
         tolerances: Of the projections.
+        progress: Told how many cells are done.
 
     Returns:
         Configurations (C, k, n) at the centres, and where all corners of a cell led to one (C,).
     """
+    count = len(points)
+    ends, followed = torch.empty_like(q), torch.empty(count, dtype=torch.bool, device=q.device)
+    for start in range(0, count, _CELLS_AT_ONCE):
+        progress("measuring cells", start, count)
+        part = slice(start, start + _CELLS_AT_ONCE)
+        ends[part], followed[part] = _lead(robot, task, points[part], q[part], tolerances)
+    progress("measuring cells", count, count)
+    return ends, followed
+
+
+def _lead(robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances) -> tuple[Tensor, Tensor]:
     count, sides, _ = points.shape
     centre = points.mean(1, keepdim=True).expand_as(points)
     columns = q.reshape(-1, robot.n).T.contiguous()
@@ -135,10 +149,10 @@ def lead_to_centres(
     return columns.T.reshape(count, sides, robot.n), followed.reshape(count, sides).all(1)
 
 
-def _spread(roadmap: Roadmap, corners: Tensor) -> Tensor:
-    robot = roadmap.robot
+def _spread(roadmap: Roadmap, corners: Tensor, progress: Progress) -> Tensor:
+    robot, tolerances = roadmap.robot, Tolerances(**roadmap.parameters["tolerances"])
     points, q = (part[corners].to(robot.lower) for part in (roadmap.points, roadmap.configurations))
-    ends, followed = lead_to_centres(robot, roadmap.task, points, q, Tolerances(**roadmap.parameters["tolerances"]))
+    ends, followed = lead_to_centres(robot, roadmap.task, points, q, tolerances, progress)
     pairs = torch.combinations(torch.arange(corners.shape[1], device=q.device))
     apart = distance(ends[:, pairs[:, 0]], ends[:, pairs[:, 1]], robot.continuous).amax(1)
     return torch.where(followed, apart, torch.inf).cpu()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.pieces import one_thread
-from grr_torch.progress import Progress
+from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.cells import LARGEST_SPREAD, lead_to_centres
 from grr_torch.resolution.relax import Network, Pulls, gauss_newton_step, move
@@ -41,7 +41,7 @@ def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances
     """
     with one_thread(), torch.no_grad():
         everything, start = corners, q
-        spread = _spread(network, corners, q, tolerances)[0]
+        spread = _spread(network, corners, q, tolerances, progress)[0]
         uncertified_before = int((spread > LARGEST_SPREAD).sum())
         corners = corners[spread > _SUSPECT]
         if uncertified_before == 0:
@@ -69,7 +69,7 @@ def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances
         if int((spread > LARGEST_SPREAD).sum()) < fewest:
             best = q
         # cells that were not looked at may have suffered
-        after = int((_spread(network, everything, best, tolerances)[0] > LARGEST_SPREAD).sum())
+        after = int((_spread(network, everything, best, tolerances, progress)[0] > LARGEST_SPREAD).sum())
     progress("certifying", _ROUNDS, _ROUNDS)
     return best if after < uncertified_before else start
 
@@ -83,11 +83,13 @@ def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> T
     return open_cells & (spread >= worst[corners].amax(1))
 
 
-def _spread(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances) -> tuple[Tensor, Tensor, Tensor]:
+def _spread(
+    network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress = silent
+) -> tuple[Tensor, Tensor, Tensor]:
     """Spread of cells (C,), and of their three pairs of corners: (2, 3C) and what is between their ends (n, 3C)."""
     robot = network.robot
     points = network.targets.T[corners]
-    ends, followed = lead_to_centres(robot, network.task, points, q.T[corners], tolerances)
+    ends, followed = lead_to_centres(robot, network.task, points, q.T[corners], tolerances, progress)
     turned = ends.roll(-1, dims=1)
     apart = difference(ends, turned, robot.continuous).transpose(0, 1).reshape(-1, robot.n).T
     pairs = torch.stack([corners.T.flatten(), corners.roll(-1, dims=1).T.flatten()])

@@ -97,14 +97,13 @@ def grow(
     wave = torch.full((count,), -1, dtype=torch.int32, device=robot.device)
     # what is averaged: rows of zeros where unresolved
     embedded = configurations.new_zeros(count, 2 * robot.n)
-    starts, ends = (part.to(robot.device) for part in graph.adjacency)
     targets = graph.points.to(device=robot.device, dtype=robot.dtype).T.contiguous()
     candidates = within_reach(robot, task, graph.points).to(robot.device)
     waiting = torch.zeros_like(candidates)
     for current in itertools.count():
         configurations[found], wave[found], candidates[found] = placed, current, False
         embedded[found] = embed(placed, robot.continuous)
-        waiting[_rows(starts, ends, found)] = True
+        waiting[graph.around(found)[1]] = True
         frontier = (waiting & candidates).nonzero()[:, 0]
         progress("expanding", int((wave >= 0).sum()), count)
         guesses, known = _average(graph, embedded, frontier, neighbours, robot.continuous)
@@ -135,15 +134,6 @@ def _average(
         sums.append(embedding_bag(nearest, embedded, per_sample_weights=weights, mode="sum"))
     total = torch.cat(sums)
     return average(total, continuous), (total != 0.0).any(1)
-
-
-def _rows(starts: Tensor, ends: Tensor, vertices: Tensor) -> Tensor:
-    """The neighbours along edges of all these vertices, one after the other."""
-    counts = starts[vertices + 1] - starts[vertices]
-    before = counts.cumsum(0) - counts
-    return ends[
-        torch.repeat_interleave(starts[vertices] - before, counts) + torch.arange(int(counts.sum()), device=ends.device)
-    ]
 
 
 def default_neighbours(task: TaskSpace) -> int:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from grr_torch.progress import Progress, silent
 from grr_torch.spaces.configuration import distance
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ class Quality:
         return asdict(self)
 
 
-def measure_quality(roadmap: Roadmap) -> Quality:
+def measure_quality(roadmap: Roadmap, progress: Progress = silent) -> Quality:
     """Computes every figure from the roadmap's tensors."""
     resolved, reachable = roadmap.resolved, roadmap.reachable
     between_resolved = int(resolved[roadmap.edges].all(1).sum())
@@ -115,7 +116,7 @@ def measure_quality(roadmap: Roadmap) -> Quality:
         smoothness_p99=levels[1],
         smoothness_max=levels[2],
         steep_edges=len(steep_edges(roadmap)),
-        **_count_cells(roadmap),
+        **_count_cells(roadmap, progress),
         max_position_error=_largest(position_error),
         max_rotation_error=_largest(rotation_error),
         min_self_collision_distance=_clearance(roadmap, q),
@@ -142,9 +143,9 @@ def steep_edges(roadmap: Roadmap, max_slope: float | None = None) -> Tensor:
     return roadmap.connected.nonzero()[:, 0][steep[slopes[steep].argsort(descending=True)]]
 
 
-def _count_cells(roadmap: Roadmap) -> dict[str, Any]:
+def _count_cells(roadmap: Roadmap, progress: Progress) -> dict[str, Any]:
     counts: dict[str, Any] = {}
-    for name, cells in zip(("triangles", "squares"), roadmap.cells(), strict=True):
+    for name, cells in zip(("triangles", "squares"), roadmap.cells(progress), strict=True):
         counts[name] = len(cells.corners)
         counts[f"{name}_wound"] = int(cells.wound.sum())
         counts[f"{name}_spread"] = int(cells.spread_out.sum())

@@ -2,6 +2,7 @@
 
 After K. Hauser and S. Emmons (2018), as the paper describes it (Section V-A): numerous random configurations a vertex,
 pairs of neighbouring vertices' configurations that pass the continuity test, then a constraint satisfaction problem.
+To test all pairs would take hours, so the nearest are tested, and round the edges that the solver leaves broken more.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from torch import Tensor
 from grr_torch.errors import ParameterError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
-from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, project_columns
-from grr_torch.resolution.reachability import within_reach
+from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
+from grr_torch.resolution.constraints import Constraints
+from grr_torch.resolution.reachability import from_random_starts, within_reach
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import difference
 from grr_torch.spaces.graph import TaskGraph
@@ -28,13 +30,13 @@ _STARTS = 40
 _ROUNDS = 12
 # pairs of configurations whose continuity is checked together
 _PAIRS_AT_ONCE = 1 << 16
-# pairs of configurations whose compatibility is held, a byte each
-_MOST_PAIRS = 4_000_000_000
-# moves of the solver: of a descent, for every vertex; and descents
-_MOVES = 1500
-_DESCENTS = 4
-# share of moves to a random value, which leads out of dead ends
-_RANDOM_MOVES = 0.1
+# pairs of configurations whose compatibility is held, two bytes each
+_MOST_PAIRS = 2_000_000_000
+# turns of the solver, and in each so many descents that start anew besides the one from the best
+_TURNS = 6
+_RESTARTS = 3
+# after each turn, so many times as many of the nearest are tested round broken edges
+_WIDER = 8
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def random_grr(
     graph: TaskGraph,
     *,
     samples: int = 100,
-    nearest: int = 6,
+    nearest: int | None = None,
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
     progress: Progress = silent,
@@ -73,7 +75,8 @@ def random_grr(
         task: The task space.
         graph: The task graph.
         samples: Configurations of a vertex.
-        nearest: Of each configuration, so many of the nearest ones at a neighbouring vertex are tested.
+        nearest: Of each configuration, so many of the nearest ones at a neighbouring vertex are tested; by default 6
+            in the plane and 2 in space, where a vertex has more neighbours.
         seed: Of all random draws.
         tolerances: Of the projections.
         progress: Told what is being done and how far it is.
@@ -84,19 +87,35 @@ def random_grr(
     most = max(1, math.isqrt(_MOST_PAIRS // max(1, len(graph.edges))))
     if not 1 <= samples <= most:
         raise ParameterError("samples", samples, f"1 to {most} for {len(graph.edges):,} edges")
+    if nearest is None:
+        nearest = 6 if task.dimension == 2 else 2
     if nearest < 1:
         raise ParameterError("nearest", nearest, "1 or more")
     generator = torch.Generator().manual_seed(check_seed(seed))
     pool, counts = _sample(robot, task, graph, samples, tolerances, generator, progress)
     edges = (counts[graph.edges] > 0).all(1).nonzero()[:, 0]
-    compatible = _test_pairs(robot, task, graph, edges, pool, min(nearest, samples), tolerances, progress)
-    solver = _MinConflicts(graph.edges[edges].numpy(), compatible.numpy(), counts.numpy(), np.random.default_rng(seed))
-    values = torch.from_numpy(solver.solve(progress))
-    configurations = pool[torch.arange(len(pool)), values]
-    first, second = graph.edges[edges].unbind(1)
+    table = _PairTable(robot, task, graph.points, graph.edges[edges], pool, tolerances)
+    table.test_nearest(min(nearest, samples), progress)
+    values = _solve(table, counts, min(_WIDER * nearest, samples), np.random.default_rng(seed), progress)
     connected = torch.zeros(len(graph.edges), dtype=torch.bool)
-    connected[edges] = compatible[torch.arange(len(edges)), values[first], values[second]]
-    return RandomMap(configurations, connected)
+    connected[edges] = table.held(values)
+    return RandomMap(pool[torch.arange(len(pool)), values], connected)
+
+
+def _solve(table: _PairTable, counts: Tensor, wider: int, random: np.random.Generator, progress: Progress) -> Tensor:
+    """(V,) which configuration each vertex takes."""
+    constraints = Constraints(table.edges.numpy(), table.compatible.numpy(), counts.numpy())
+    best = constraints.grow(random)
+    for turn in range(_TURNS):
+        progress("solving constraints", turn, _TURNS)
+        starts = [best, *(constraints.grow(random) for _ in range(_RESTARTS))]
+        descents = [best, *(constraints.descend(start, random) for start in starts)]
+        best = max(descents, key=lambda values: int(constraints.held(values).sum()))
+        if bool(constraints.held(best).all()):
+            break
+        table.test_round_broken(torch.from_numpy(best), wider)
+    progress("solving constraints", _TURNS, _TURNS)
+    return torch.from_numpy(best)
 
 
 def _sample(
@@ -117,124 +136,84 @@ def _sample(
         vertices = (open_vertices & (counts < samples)).nonzero()[:, 0]
         if len(vertices) == 0:
             break
-        guesses = robot.sample(len(vertices) * _STARTS, generator)
-        targets = graph.points[vertices].repeat_interleave(_STARTS, dim=0).to(guesses)
-        solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
-        valid = valid.cpu().reshape(len(vertices), _STARTS)
+        solved, valid = from_random_starts(robot, task, graph.points[vertices], _STARTS, generator, tolerances)
         rank = counts[vertices, None] + valid.cumsum(1) - 1
         kept = valid & (rank < samples)
         rows = vertices[:, None].expand_as(rank)
-        pool[rows[kept], rank[kept]] = solved.T.cpu().reshape(len(vertices), _STARTS, robot.n)[kept]
+        pool[rows[kept], rank[kept]] = solved[kept]
         counts[vertices] = (counts[vertices] + valid.sum(1)).clamp(max=samples)
         open_vertices = open_vertices & (counts > 0)
     progress("sampling", _ROUNDS, _ROUNDS)
     return pool, counts
 
 
-def _test_pairs(
-    robot: Robot,
-    task: TaskSpace,
-    graph: TaskGraph,
-    edges: Tensor,
-    pool: Tensor,
-    nearest: int,
-    tolerances: Tolerances,
-    progress: Progress,
-) -> Tensor:
-    """(E, samples, samples) bool: pairs of an edge's configurations that pass the continuity test."""
-    samples = pool.shape[1]
-    compatible = torch.zeros(len(edges), samples, samples, dtype=torch.bool)
-    wraps = robot.continuous.cpu()
-    at_once = max(1, _PAIRS_AT_ONCE // (2 * samples * nearest))
-    for start in range(0, len(edges), at_once):
-        progress("testing pairs", start, len(edges))
-        part = edges[start : start + at_once]
-        first, second = graph.edges[part].unbind(1)
-        apart = difference(pool[first][:, :, None], pool[second][:, None], wraps).square().sum(-1).nan_to_num(torch.inf)
-        close = torch.zeros_like(apart, dtype=torch.bool)
-        close.scatter_(2, apart.topk(nearest, dim=2, largest=False).indices, True)
-        close.scatter_(1, apart.topk(nearest, dim=1, largest=False).indices, True)
-        edge, i, j = (close & apart.isfinite()).nonzero().unbind(1)
-        passed = is_continuous(
-            robot,
-            task,
-            graph.points[first[edge]],
-            graph.points[second[edge]],
-            pool[first[edge], i],
-            pool[second[edge], j],
-            tolerances=tolerances,
-        ).cpu()
-        compatible[start + edge[passed], i[passed], j[passed]] = True
-    progress("testing pairs", len(edges), len(edges))
-    return compatible
+class _PairTable:
+    """Which pairs of neighbouring vertices' configurations pass the continuity test, as far as it is known.
 
-
-class _MinConflicts:
-    """Picks a value for every variable so that as many constraints hold as possible.
-
-    Min-conflicts with random descents: a variable with a broken constraint takes the value that breaks fewest, ties
-    and now and then a value at random; the best assignment of several descents is kept.
+    Attributes:
+        edges: (E, 2) vertices.
+        compatible: (E, samples, samples) bool, pairs that passed.
     """
 
-    def __init__(self, edges: np.ndarray, compatible: np.ndarray, counts: np.ndarray, random: np.random.Generator):
-        self.edges, self.compatible, self.counts, self.random = edges, compatible, counts, random
-        variables, values = len(counts), compatible.shape[1]
-        self.size = (variables, values)
-        around: list[list[tuple[int, int, bool]]] = [[] for _ in range(variables)]
-        for edge, (a, b) in enumerate(edges.tolist()):
-            around[a].append((edge, b, True))
-            around[b].append((edge, a, False))
-        self.around = around
+    def __init__(
+        self, robot: Robot, task: TaskSpace, points: Tensor, edges: Tensor, pool: Tensor, tolerances: Tolerances
+    ):
+        self.robot, self.task, self.points, self.tolerances = robot, task, points, tolerances
+        self.edges, self.pool = edges, pool
+        samples = pool.shape[1]
+        self.compatible = torch.zeros(len(edges), samples, samples, dtype=torch.bool)
+        self._tested = torch.zeros_like(self.compatible)
 
-    def solve(self, progress: Progress) -> np.ndarray:
-        """(V,) values."""
-        best, most = np.zeros(self.size[0], dtype=np.int64), -1
-        for descent in range(_DESCENTS):
-            progress("solving constraints", descent, _DESCENTS)
-            values = self._descend()
-            held = int(self._held(values).sum())
-            if held > most:
-                best, most = values, held
-            if most == len(self.edges):
-                break
-        progress("solving constraints", _DESCENTS, _DESCENTS)
-        return best
+    def held(self, values: Tensor) -> Tensor:
+        """(E,) edges whose pair passed, for the configurations (V,) that vertices take."""
+        first, second = self.edges.unbind(1)
+        return self.compatible[torch.arange(len(self.edges)), values[first], values[second]]
 
-    def _held(self, values: np.ndarray) -> np.ndarray:
-        first, second = self.edges.T
-        return self.compatible[np.arange(len(self.edges)), values[first], values[second]]
+    def test_nearest(self, nearest: int, progress: Progress) -> None:
+        """Tests, of each configuration, so many of the nearest at a neighbouring vertex."""
+        samples = self.pool.shape[1]
+        at_once = max(1, _PAIRS_AT_ONCE // (2 * samples * nearest))
+        for start in range(0, len(self.edges), at_once):
+            progress("testing pairs", start, len(self.edges))
+            first, second = (self.pool[ends] for ends in self.edges[start : start + at_once].unbind(1))
+            apart = self._apart(first[:, :, None], second[:, None])
+            close = torch.zeros_like(apart, dtype=torch.bool)
+            for axis in (1, 2):
+                close.scatter_(axis, apart.topk(nearest, dim=axis, largest=False).indices, True)
+            edge, i, j = (close & apart.isfinite()).nonzero().unbind(1)
+            self._test(start + edge, i, j)
+        progress("testing pairs", len(self.edges), len(self.edges))
 
-    def _descend(self) -> np.ndarray:
-        values = self.random.integers(0, np.maximum(self.counts, 1))
-        scores = np.zeros(self.size, dtype=np.int64)
-        scores[np.arange(self.size[1]) >= self.counts[:, None]] = -(10**6)
-        first, second = self.edges.T
-        order = np.arange(len(self.edges))
-        np.add.at(scores, first, self.compatible[order, :, values[second]])
-        np.add.at(scores, second, self.compatible[order, values[first], :])
-        degree = np.bincount(self.edges.ravel(), minlength=self.size[0])
-        best, most = values.copy(), -1
-        for _ in range(_MOVES):
-            held = scores[np.arange(self.size[0]), values]
-            conflicted = np.flatnonzero((held < degree) & (degree > 0))
-            if int(held[degree > 0].sum()) > most:
-                best, most = values.copy(), int(held[degree > 0].sum())
-            if len(conflicted) == 0:
-                break
-            for variable in self.random.permutation(conflicted).tolist():
-                self._move(variable, values, scores)
-        return best
+    def test_round_broken(self, values: Tensor, nearest: int) -> None:
+        """Tests what else the ends of broken edges could take, against what their neighbours have.
 
-    def _move(self, variable: int, values: np.ndarray, scores: np.ndarray) -> None:
-        row = scores[variable]
-        old = int(values[variable])
-        if self.random.random() < _RANDOM_MOVES:
-            new = int(self.random.integers(0, self.counts[variable]))
-        else:
-            new = int(self.random.choice(np.flatnonzero(row == row.max())))
-        if new == old:
-            return
-        values[variable] = new
-        for edge, other, is_first in self.around[variable]:
-            table = self.compatible[edge] if is_first else self.compatible[edge].T
-            scores[other] += table[new].astype(np.int64) - table[old]
+        Args:
+            values: (V,) the configuration that each vertex takes.
+            nearest: Of a vertex's configurations, so many of the nearest to the neighbour's are tested.
+        """
+        wanted = torch.zeros(len(values), dtype=torch.bool)
+        wanted[self.edges[~self.held(values)]] = True
+        for side in (0, 1):
+            edge = wanted[self.edges[:, side]].nonzero()[:, 0]
+            own, other = self.edges[edge, side], self.edges[edge, 1 - side]
+            apart = self._apart(self.pool[own], self.pool[other, values[other]][:, None])
+            near, taken = apart.topk(nearest, dim=1, largest=False)
+            pairs = (taken.flatten(), values[other].repeat_interleave(nearest))
+            i, j = pairs if side == 0 else pairs[::-1]
+            edge = edge.repeat_interleave(nearest)
+            new = near.flatten().isfinite() & ~self._tested[edge, i, j]
+            self._test(edge[new], i[new], j[new])
+
+    def _apart(self, first: Tensor, second: Tensor) -> Tensor:
+        """Squared distances of configurations; inf where there is none."""
+        apart = difference(first, second, self.robot.continuous.cpu()).square().sum(-1)
+        return apart.nan_to_num(torch.inf)
+
+    def _test(self, edge: Tensor, i: Tensor, j: Tensor) -> None:
+        for part in torch.stack([edge, i, j]).split(_PAIRS_AT_ONCE, dim=1):
+            edge, i, j = part
+            a, b = self.edges[edge].unbind(1)
+            ends = self.points[a], self.points[b], self.pool[a, i], self.pool[b, j]
+            passed = is_continuous(self.robot, self.task, *ends, tolerances=self.tolerances).cpu()
+            self.compatible[edge, i, j] = passed
+            self._tested[edge, i, j] = True

@@ -47,13 +47,20 @@ def measure_reachability(
     for done in range(0, attempts, _ROUND):
         progress("measuring reachability", done, attempts)
         starts = min(_ROUND, attempts - done)
-        guesses = robot.sample(len(left) * starts, generator).T.contiguous()
-        targets = points[left].repeat_interleave(starts, dim=0).to(guesses).T.contiguous()
-        valid = project_columns(robot, task, targets, guesses, tolerances)[1].cpu()
-        reached[left] = valid.reshape(-1, starts).any(1)
+        reached[left] = from_random_starts(robot, task, points[left], starts, generator, tolerances)[1].any(1)
         left = left[~reached[left]]
     progress("measuring reachability", attempts, attempts)
     return reached
+
+
+def from_random_starts(
+    robot: Robot, task: TaskSpace, points: Tensor, starts: int, generator: torch.Generator, tolerances: Tolerances
+) -> tuple[Tensor, Tensor]:
+    """Projections of random configurations: (V, starts, n), NaN where not valid, and valid (V, starts); on the CPU."""
+    guesses = robot.sample(len(points) * starts, generator)
+    targets = points.repeat_interleave(starts, dim=0).to(guesses)
+    solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
+    return solved.T.cpu().reshape(len(points), starts, robot.n), valid.cpu().reshape(len(points), starts)
 
 
 def within_reach(robot: Robot, task: TaskSpace, points: Tensor) -> Tensor:

@@ -11,126 +11,126 @@ import torch
 from torch import Tensor
 
 from grr_torch.progress import Progress, silent
-from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.cells import triangles
 from grr_torch.resolution.certify import certify
-from grr_torch.resolution.quality import Quality
+from grr_torch.resolution.edges import continuous_edges
+from grr_torch.resolution.objectives import Objective, check_objectives, measure_objective
+from grr_torch.resolution.quality import edge_slopes
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.resolution.repair import repair
+from grr_torch.resolution.report import BEFORE
 from grr_torch.resolution.roadmap import Roadmap
 
-# what `parameters["refinement"]` keeps of the quality before
-BEFORE = ("resolved_vertices", "connected_edges", "smoothness", "triangles_wound", "triangles_spread")
+# of an objective's scale: no arm is at a singularity or a limit everywhere
+_LEAST_SCALE = 1e-9
 
 
-def refine(roadmap: Roadmap, *, seed: int = 0, progress: Progress = silent) -> Roadmap:
+def refine(
+    roadmap: Roadmap, *, objectives: Mapping[str, float] | None = None, seed: int = 0, progress: Progress = silent
+) -> Roadmap:
     """Improves a roadmap: more vertices, more edges, and a smaller mean of D_q / D_p.
 
     Unresolved vertices and the ends of broken edges are tried again from all their neighbours and from random starts;
     then all configurations move along their self-motion manifolds at once. No vertex and no connected edge is lost:
-    where the relaxed map breaks an edge, its ends go back to where they were.
+    where the relaxed map breaks an edge, its ends go back to where they were. With objectives, the smoothest map is
+    then relaxed once more, for the sum that `grr_torch.resolution.objectives` gives.
 
     Args:
         roadmap: The roadmap.
+        objectives: Weights of "clearance", "manipulability" and "limits"; one with weight 0 is only reported.
         seed: Of the random starts.
         progress: Told what is being done and how far it is.
 
     Returns:
         The refined roadmap; its `build_seconds` include the refinement, and `parameters["refinement"]` tells what it
-        was before.
+        was before; of objectives, their means and worst over the vertices, for the smoothest map and for this one.
+
+    Raises:
+        UnknownNameError: No such objective.
+        ParameterError: A weight is not valid, or the robot has no such objective.
     """
-    before = roadmap.quality()
+    weights = check_objectives(roadmap.robot, objectives)
+    before = roadmap.quality(progress)
     begin = time.perf_counter()
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
-    repaired = repair(roadmap, tolerances, seed)
-    refined = _relaxed(repaired, tolerances, progress)
+    smoothest = _relaxed(repair(roadmap, tolerances, seed, progress), {}, tolerances, progress)
+    wanted = {name: weight for name, weight in weights.items() if weight > 0.0}
+    refined = _relaxed(smoothest, wanted, tolerances, progress) if wanted else smoothest
     seconds = time.perf_counter() - begin
-    kept = {name: getattr(before, name) for name in BEFORE}
+    told: dict[str, Any] = {**{name: getattr(before, name) for name in BEFORE}, "seconds": seconds}
+    if weights:
+        slopes = edge_slopes(smoothest)
+        told["smoothest"] = float(slopes.mean()) if len(slopes) else None
+        told["objectives"] = {
+            name: {"weight": weight, "before": _figures(smoothest, name), "after": _figures(refined, name)}
+            for name, weight in weights.items()
+        }
     return replace(
         refined,
-        parameters={**roadmap.parameters, "refinement": {**kept, "seconds": seconds}},
+        parameters={**roadmap.parameters, "refinement": told},
         build_seconds=roadmap.build_seconds + seconds,
     )
 
 
-def _relaxed(roadmap: Roadmap, tolerances: Tolerances, progress: Progress) -> Roadmap:
-    """The relaxed map, but for the surroundings of edges that it would break."""
-    robot, task = roadmap.robot, roadmap.task
+def _figures(roadmap: Roadmap, objective: str) -> dict[str, float | None]:
+    """Mean and worst of an objective over the resolved vertices; None if there are none."""
+    q = roadmap.configurations[roadmap.resolved]
+    if len(q) == 0:
+        return {"mean": None, "worst": None}
+    values = measure_objective(roadmap.robot, roadmap.task, objective, q)
+    return {"mean": float(values.mean()), "worst": float(values.min())}
+
+
+def _relaxed(roadmap: Roadmap, weights: Mapping[str, float], tolerances: Tolerances, progress: Progress) -> Roadmap:
+    """The relaxed and certified map, but for the surroundings of edges that it would break."""
     edges = roadmap.edges[roadmap.connected]
     if len(edges) == 0:
         return roadmap
     vertices = roadmap.resolved.nonzero()[:, 0]
     rank = torch.full((len(roadmap.points),), -1).index_put_((vertices,), torch.arange(len(vertices)))
-    network = Network(
-        robot,
-        task,
-        roadmap.points[vertices].to(robot.lower).T.contiguous(),
-        rank[edges].T.contiguous().to(robot.device),
-        task.distance(roadmap.points[edges[:, 0]], roadmap.points[edges[:, 1]]).to(robot.lower),
-    )
-    old = roadmap.configurations[vertices].to(robot.lower)
+    network = _network(roadmap, vertices, rank[edges], weights)
+    old = roadmap.configurations[vertices].to(roadmap.robot.lower)
     new = relax(network, old.T.contiguous(), tolerances, progress)
-    cells = rank[triangles(edges, len(roadmap.points))].to(robot.device)
+    cells = rank[triangles(edges, len(roadmap.points))].to(roadmap.robot.device)
     new = certify(network, cells, new, tolerances, progress).T
     configurations = roadmap.configurations.clone()
     configurations[vertices] = new.cpu()
+    return _without_losses(roadmap, configurations, tolerances, progress)
+
+
+def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping[str, float]) -> Network:
+    """The resolved vertices, joined by edges (E, 2) between their ranks."""
+    robot, task = roadmap.robot, roadmap.task
+    points = roadmap.points[vertices].to(robot.lower)
+    lengths = task.distance(points[edges[:, 0]], points[edges[:, 1]])
+    slope_share = float(edge_slopes(roadmap).sum()) / len(vertices)
+    objectives = tuple(
+        Objective(robot, task, name, weight * slope_share, max(mean, _LEAST_SCALE))
+        for name, weight in weights.items()
+        if (mean := _figures(roadmap, name)["mean"]) is not None
+    )
+    return Network(robot, task, points.T.contiguous(), edges.T.contiguous().to(robot.device), lengths, objectives)
+
+
+def _without_losses(roadmap: Roadmap, configurations: Tensor, tolerances: Tolerances, progress: Progress) -> Roadmap:
+    """The roadmap with new configurations, but with its own round edges that would be lost."""
     connected = torch.zeros_like(roadmap.connected)
     stale = torch.ones_like(roadmap.connected)
+    configurations = configurations.clone()
+    robot, task, points, resolved = roadmap.robot, roadmap.task, roadmap.points, roadmap.resolved
     while True:
-        check = (stale & roadmap.resolved[roadmap.edges].all(1)).nonzero()[:, 0]
-        connected[check] = _continuous(roadmap, configurations, check, tolerances)
+        edges = roadmap.edges[stale]
+        connected[stale] = continuous_edges(
+            robot, task, points, configurations, resolved, edges, tolerances, progress
+        ).cpu()
         lost = roadmap.edges[roadmap.connected & ~connected].unique()
         if len(lost) == 0:
             return replace(roadmap, configurations=configurations, connected=connected)
-        moved = (configurations != roadmap.configurations).any(1) & roadmap.resolved
+        moved = (configurations != roadmap.configurations).any(1) & resolved
         if not bool(moved.any()):
             # an edge was called connected that is not
             return replace(roadmap, connected=connected)
         back = lost[moved[lost]] if bool(moved[lost].any()) else moved.nonzero()[:, 0]
         configurations[back] = roadmap.configurations[back]
         stale = torch.isin(roadmap.edges, back).any(1)
-
-
-def _continuous(roadmap: Roadmap, configurations: Tensor, edges: Tensor, tolerances: Tolerances) -> Tensor:
-    first, second = roadmap.edges[edges].unbind(1)
-    return is_continuous(
-        roadmap.robot,
-        roadmap.task,
-        roadmap.points[first],
-        roadmap.points[second],
-        configurations[first],
-        configurations[second],
-        tolerances=tolerances,
-    ).cpu()
-
-
-def check_refinement(parameters: Mapping[str, Any]) -> None:
-    """Checks what a file says of a roadmap before its refinement.
-
-    Raises:
-        ValueError: A figure is missing or is no number.
-    """
-    before = parameters.get("refinement")
-    if before is None:
-        return
-    for name in (*BEFORE, "seconds"):
-        if not isinstance(before, dict) or not isinstance(before.get(name), int | float | None):
-            raise ValueError(f"'refinement' without a number '{name}'")
-
-
-def summary(roadmap: Roadmap, quality: Quality) -> str:
-    """What the refinement of a roadmap changed, in one line; empty if it was not refined."""
-    before = roadmap.parameters.get("refinement")
-    if before is None:
-        return ""
-    named = (
-        ("vertices", "resolved_vertices"),
-        ("edges", "connected_edges"),
-        ("windings", "triangles_wound"),
-        ("spread triangles", "triangles_spread"),
-    )
-    changes = [f"{name} {before[key]:,} → {getattr(quality, key):,}" for name, key in named]
-    if before["smoothness"] is not None and quality.smoothness is not None:
-        changes.insert(0, f"smoothness {before['smoothness']:.3f} → {quality.smoothness:.3f}")
-    return ", ".join(changes) + f", in {before['seconds']:.2f} s"

@@ -9,15 +9,18 @@ its squares stand for the norms themselves (iteratively reweighted least squares
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress
-from grr_torch.projection.columns import null_space_projector
+from grr_torch.projection.columns import null_space_projector, transposed_product
 from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.resolution.objectives import Objective
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import difference, normalise
 from grr_torch.spaces.task import TaskSpace
@@ -32,6 +35,44 @@ _LONGEST_STEP = 0.3
 _SHORTEST = 1e-2
 
 
+class _Incidence(NamedTuple):
+    """Edges by vertex, so that what they do to it is summed in one order, whatever the device.
+
+    Attributes:
+        starts: (V,) where a vertex's edges start in the others.
+        edges: (2E,) index of an edge.
+        ends: (2E,) its other vertex.
+        signs: (2E,) 1 at its first vertex, −1 at its second.
+    """
+
+    starts: Tensor
+    edges: Tensor
+    ends: Tensor
+    signs: Tensor
+
+    @staticmethod
+    def of(edges: Tensor, like: Tensor) -> _Incidence:
+        """For edges (2, E) between the columns of `like`."""
+        vertices, count = edges.flatten(), edges.shape[1]
+        order = vertices.argsort(stable=True)
+        counts = vertices.bincount(minlength=like.shape[1])
+        signs = torch.where(order < count, like.new_tensor(1.0), -1.0)
+        return _Incidence(counts.cumsum(0) - counts, order % count, edges.flip(0).flatten()[order], signs)
+
+    def gather(self, forces: Tensor) -> Tensor:
+        """(n, V) sums of what edges (n, E) do to their first vertex, and the opposite to their second."""
+        return _sum_bags(self.edges, forces, self.starts, self.signs)
+
+    def neighbours(self, x: Tensor, weights: Tensor) -> Tensor:
+        """(n, V) sums of x (n, V) over the edges' other ends, weighted (E,)."""
+        return _sum_bags(self.ends, x, self.starts, weights[self.edges])
+
+
+def _sum_bags(indices: Tensor, columns: Tensor, starts: Tensor, weights: Tensor) -> Tensor:
+    rows = columns.T.contiguous()
+    return embedding_bag(indices, rows, starts, per_sample_weights=weights, mode="sum").T
+
+
 @dataclass(frozen=True)
 class Network:
     """Vertices on their self-motion manifolds, and the edges that pull at them.
@@ -42,6 +83,9 @@ class Network:
         targets: (width, V) points.
         edges: (2, E) vertices of each edge.
         lengths: (E,) D_p of each edge.
+        objectives: What else counts.
+        parts: (V,) number of the map that a vertex belongs to, if there are several without edges between them: each is
+            then relaxed as if it were alone.
     """
 
     robot: Robot
@@ -49,16 +93,25 @@ class Network:
     targets: Tensor
     edges: Tensor
     lengths: Tensor
+    objectives: tuple[Objective, ...] = ()
+    parts: Tensor | None = None
+
+    @cached_property
+    def incidence(self) -> _Incidence:
+        """Its edges by vertex."""
+        return _Incidence.of(self.edges, self.targets)
 
     def motions(self, q: Tensor) -> Tensor:
         """(n, E) wrapped differences along the edges."""
         first, second = self.edges
         return difference(q[:, first], q[:, second], self.robot.continuous[:, None])
 
-    def cost(self, q: Tensor) -> float:
-        """Sum of D_q / D_p, rounded off at zero, for configurations (n, V)."""
-        squared = self.motions(q).square().sum(0)
-        return float(((squared + _SHORTEST**2).sqrt() / self.lengths).sum())
+    def costs(self, q: Tensor) -> Tensor:
+        """(P,) sums of D_q / D_p, rounded off at zero, by part, and of the objectives' costs, for (n, V)."""
+        slopes = (self.motions(q).square().sum(0) + _SHORTEST**2).sqrt() / self.lengths
+        if self.parts is not None:
+            return self.parts[self.edges[0]].bincount(slopes, minlength=int(self.parts.max()) + 1)
+        return slopes.sum()[None] + sum(objective.cost(q) for objective in self.objectives)
 
 
 class Pulls(NamedTuple):
@@ -77,53 +130,59 @@ class Pulls(NamedTuple):
 
 def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progress, rounds: int = _ROUNDS) -> Tensor:
     """Configurations (n, V) of lower cost: converged, within limits and free of self-collision like those given."""
-    damping, cost = 1e-2, network.cost(q)
+    parts = network.parts if network.parts is not None else torch.zeros_like(network.targets[0], dtype=torch.long)
+    costs = network.costs(q)
+    damping = torch.full_like(costs, 1e-2)
+    going_on = torch.ones_like(costs, dtype=torch.bool)
     with one_thread(), torch.no_grad():
         for done in range(rounds):
             progress("refining", done, rounds)
-            moved = move(network, q, gauss_newton_step(network, q, damping), tolerances)
-            new_cost = network.cost(moved)
-            if new_cost < cost:
-                gain = 1.0 - new_cost / cost
-                q, cost, damping = moved, new_cost, max(0.3 * damping, 1e-4)
-                if gain < _LEAST_GAIN:
-                    break
-            else:
-                damping *= 10.0
-                if damping > 1e3:
-                    break
+            moved = move(network, q, gauss_newton_step(network, q, damping[parts]), tolerances)
+            new_costs = network.costs(moved)
+            better = going_on & (new_costs < costs)
+            going_on = torch.where(better, new_costs < (1.0 - _LEAST_GAIN) * costs, going_on & (damping <= 1e2))
+            q, costs = torch.where(better[parts], moved, q), torch.where(better, new_costs, costs)
+            damping = torch.where(better, (0.3 * damping).clamp_min(1e-4), 10.0 * damping)
+            if not bool(going_on.any()):
+                break
     progress("refining", rounds, rounds)
     return q
 
 
-def gauss_newton_step(network: Network, q: Tensor, damping: float, pulls: Pulls | None = None) -> Tensor:
-    """A step (n, V) that lowers the edges' slopes and the pulls, by preconditioned conjugate gradients."""
+def gauss_newton_step(network: Network, q: Tensor, damping: float | Tensor, pulls: Pulls | None = None) -> Tensor:
+    """A step (n, V) that lowers slopes, pulls and the objectives' costs, by preconditioned conjugate gradients.
+
+    The damping may be one for each vertex (V,).
+    """
     robot = network.robot
     motions = network.motions(q)
     weights = 1.0 / ((motions.square().sum(0) + _SHORTEST**2).sqrt() * network.lengths)
     jacobian = network.task.jacobian(robot.tree.jacobian(robot.tree.frames(q)))
     # small, but large enough for the pivots of a straight arm
     projector = null_space_projector(jacobian, torch.finfo(q.dtype).eps ** 0.6)
-    edges = network.edges
+    incidence = network.incidence
     if pulls is not None:
-        edges = torch.cat([edges, pulls.pairs], dim=1)
+        incidence = _Incidence.of(torch.cat([network.edges, pulls.pairs], dim=1), q)
         motions, weights = torch.cat([motions, pulls.motions], dim=1), torch.cat([weights, pulls.weights])
-    first, second = edges
-    stiffness = weights.new_zeros(q.shape[1]).index_add_(0, first, weights).index_add_(0, second, weights)
+    held = incidence.neighbours(torch.ones_like(q[:1]), weights)[0]
+    forces = incidence.gather(weights * motions)
+    models = [objective.model(q) for objective in network.objectives]
+    directions = [direction for _, curved in models for direction in curved]
+    stiffness = held + sum(direction.square().sum(0) for direction in directions)
     # a vertex without edges stays
     stiffness = torch.where(stiffness > 0.0, stiffness, 1.0)
 
-    def gather(forces: Tensor) -> Tensor:
-        return torch.zeros_like(q).index_add_(1, second, -forces).index_add_(1, first, forces)
-
     def allowed(x: Tensor) -> Tensor:
-        return (projector * x).sum(1)
+        return transposed_product(projector, x)
 
     def apply(x: Tensor) -> Tensor:
-        return allowed(gather(weights * (x[:, first] - x[:, second]))) + damping * stiffness * x
+        bent = held * x - incidence.neighbours(x, weights)
+        for direction in directions:
+            bent.addcmul_(direction, (direction * x).sum(0))
+        return allowed(bent).addcmul_(damping * stiffness, x)
 
     step = torch.zeros_like(q)
-    residual = allowed(gather(weights * motions))
+    residual = allowed(forces + sum(pull for pull, _ in models))
     direction = scaled = residual / stiffness
     size = start = (residual * scaled).sum()
     for _ in range(_GRADIENT_STEPS):
@@ -131,7 +190,7 @@ def gauss_newton_step(network: Network, q: Tensor, damping: float, pulls: Pulls 
             break
         applied = apply(direction)
         length = size / (direction * applied).sum()
-        step = torch.add(step, direction * length)
+        step.addcmul_(direction, length)
         residual = residual - applied * length
         scaled = allowed(residual / stiffness)
         before, size = size, (residual * scaled).sum()

@@ -66,22 +66,30 @@ class Roadmap:
         """The task graph G_p."""
         return TaskGraph(self.points, self.edges, find_lattice(self.points))
 
-    def quality(self) -> Quality:
-        """Connectivity, smoothness, coverage, cells and residuals, computed once from the tensors."""
-        return self._quality
+    def quality(self, progress: Progress = silent) -> Quality:
+        """Connectivity, smoothness, coverage, cells and residuals, computed once from the tensors.
 
-    def cells(self) -> tuple[Cells, Cells]:
-        """The triangles of the roadmap, and in R³ the faces of its grid's cells, with their winding and spread."""
-        return self._cells
+        Args:
+            progress: Told how many cells are measured.
+        """
+        if "quality" not in self._measured:
+            self._measured["quality"] = measure_quality(self, progress)
+        return self._measured["quality"]
+
+    def cells(self, progress: Progress = silent) -> tuple[Cells, Cells]:
+        """The triangles of the roadmap, and in R³ the faces of its grid's cells, with their winding and spread.
+
+        Args:
+            progress: Told how many cells are measured.
+        """
+        if "cells" not in self._measured:
+            corners = triangles(self.edges[self.connected], len(self.points)), squares(self)
+            self._measured["cells"] = tuple(measure_cells(self, part, progress) for part in corners)
+        return self._measured["cells"]
 
     @cached_property
-    def _quality(self) -> Quality:
-        return measure_quality(self)
-
-    @cached_property
-    def _cells(self) -> tuple[Cells, Cells]:
-        corners = triangles(self.edges[self.connected], len(self.points)), squares(self)
-        return measure_cells(self, corners[0]), measure_cells(self, corners[1])
+    def _measured(self) -> dict[str, Any]:
+        return {}
 
     @cached_property
     def uncertified(self) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ from grr_torch.errors import FileFormatError, GrrError
 from grr_torch.output import atomic_write
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.quality import Quality
-from grr_torch.resolution.refine import check_refinement
+from grr_torch.resolution.report import check_refinement
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.load import make_robot
 from grr_torch.robots.presets import load_preset, robot_names

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
-from grr_torch.resolution.build import check_edges
+from grr_torch.resolution.edges import check_edges
 from grr_torch.resolution.quality import quality_differences
 from grr_torch.resolution.roadmap_file import load_roadmap, metadata_hash, read_file, tensors_hash
 
@@ -36,14 +36,14 @@ def verify_file(path: str | os.PathLike[str], *, progress: Progress = silent) ->
 
     Args:
         path: The file.
-        progress: Told how many edges are checked.
+        progress: Told how many cells and edges are checked.
 
     Raises:
         FileFormatError: The file cannot be loaded at all.
     """
     metadata, tensors = read_file(path)
     roadmap = load_roadmap(path)
-    quality = roadmap.quality()
+    quality = roadmap.quality(progress)
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
     robot = metadata["robot"]
     stored_hash, found_hash = str(metadata.get("tensors_sha256")), tensors_hash(tensors)

@@ -91,6 +91,29 @@ class TaskGraph:
         rows = csr_matrix((np.ones(len(both[0]), dtype=np.int8), both), shape=(len(self.points),) * 2)
         return torch.from_numpy(rows.indptr.astype(np.int64)), torch.from_numpy(rows.indices.astype(np.int64))
 
+    def around(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """The neighbours along edges of some vertices (F,), one after the other.
+
+        Returns:
+            Ranks (K,) in `vertices`, which say whose neighbour it is, and the neighbours (K,).
+        """
+        starts, ends = self.adjacency
+        chosen = vertices.cpu()
+        counts = starts[chosen + 1] - starts[chosen]
+        rank = torch.repeat_interleave(torch.arange(len(chosen)), counts)
+        places = torch.arange(len(rank)) + (starts[chosen] - counts.cumsum(0) + counts)[rank]
+        return rank.to(vertices.device), ends[places].to(vertices.device)
+
+    def edge_between(self, first: Tensor, second: Tensor) -> Tensor:
+        """Indices (K,) of the edges that join vertices (K,) to others (K,)."""
+        keys, order = self._sorted_keys
+        pairs = torch.stack([first, second], dim=1).sort(dim=1).values
+        return order[torch.searchsorted(keys, pairs[:, 0] * len(self.points) + pairs[:, 1])]
+
+    @cached_property
+    def _sorted_keys(self) -> tuple[Tensor, Tensor]:
+        return (self.edges[:, 0] * len(self.points) + self.edges[:, 1]).sort()
+
 
 @dataclass(frozen=True, eq=False)
 class Copies(TaskGraph):

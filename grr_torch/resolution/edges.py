@@ -1,0 +1,63 @@
+"""The continuity of a roadmap's edges, however many there are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from grr_torch.progress import Progress, silent
+from grr_torch.projection.continuity import is_continuous
+from grr_torch.projection.project import Tolerances
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.task import TaskSpace
+
+if TYPE_CHECKING:
+    from grr_torch.resolution.roadmap import Roadmap
+
+# edges that are checked together
+_AT_ONCE = 16384
+
+
+def check_edges(roadmap: Roadmap, tolerances: Tolerances, progress: Progress = silent) -> Tensor:
+    """Which edges of a roadmap are continuous, checked anew: (E,) bool."""
+    parts = (roadmap.points, roadmap.configurations, roadmap.resolved, roadmap.edges)
+    return continuous_edges(roadmap.robot, roadmap.task, *parts, tolerances, progress).cpu()
+
+
+def continuous_edges(
+    robot: Robot,
+    task: TaskSpace,
+    points: Tensor,
+    configurations: Tensor,
+    resolved: Tensor,
+    edges: Tensor,
+    tolerances: Tolerances,
+    progress: Progress,
+) -> Tensor:
+    """Which edges between resolved vertices are continuous: (E,) bool, on the robot's device.
+
+    Args:
+        robot: The robot.
+        task: The task space.
+        points: (V, width) points.
+        configurations: (V, n) configurations.
+        resolved: (V,) vertices that have one.
+        edges: (E, 2) vertices of each edge.
+        tolerances: Of the projections.
+        progress: Told how many edges are checked.
+    """
+    configurations, resolved, edges = (part.to(robot.device) for part in (configurations, resolved, edges))
+    configurations = configurations.to(robot.dtype)
+    points = points.to(configurations)
+    connected = torch.zeros(len(edges), dtype=torch.bool, device=robot.device)
+    candidates = resolved[edges].all(1).nonzero()[:, 0]
+    for start in range(0, len(candidates), _AT_ONCE):
+        progress("checking edges", start, len(candidates))
+        part = candidates[start : start + _AT_ONCE]
+        a, b = edges[part].T
+        ends = points[a], points[b], configurations[a], configurations[b]
+        connected[part] = is_continuous(robot, task, *ends, tolerances=tolerances)
+    progress("checking edges", len(candidates), len(candidates))
+    return connected

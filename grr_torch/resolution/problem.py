@@ -1,0 +1,114 @@
+"""What a roadmap is built for: task, graph and seeds, from what is given and the robot's preset."""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import torch
+
+from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError
+from grr_torch.resolution.reachability import reach, within_reach
+from grr_torch.resolution.seeds import SeedsLike
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.graph import Bounds, TaskGraph, staggered_grid
+from grr_torch.spaces.task import TaskSpace, make_task
+
+
+class Problem(NamedTuple):
+    """What a roadmap is built for.
+
+    Attributes:
+        task: The task space.
+        graph: Its task graph.
+        seeds: A table of configurations, or "auto".
+    """
+
+    task: TaskSpace
+    graph: TaskGraph
+    seeds: SeedsLike | str
+
+
+def pose_problem(
+    robot: Robot,
+    task: TaskSpace | str | None = None,
+    points: int | TaskGraph | None = None,
+    bounds: Bounds | None = None,
+    seeds: SeedsLike | str | None = None,
+) -> Problem:
+    """Task, graph and seeds, with what was not given taken from the robot's preset; as `build` takes them.
+
+    Raises:
+        UnknownNameError: No such task or seeds.
+        ParameterError: Something is missing, does not fit the robot, or lies beyond its reach.
+    """
+    problem = _complete(robot, task, points, bounds, seeds)
+    check_task(robot, problem.task)
+    _check_reach(robot, problem.task, problem.graph)
+    return problem
+
+
+def check_task(robot: Robot, task: TaskSpace) -> None:
+    """Checks that a robot can be asked for this task.
+
+    Raises:
+        ParameterError: An SE(2) task for a robot that leaves the plane, or a task in space for one that does not.
+    """
+    position, rotation = robot.forward_kinematics(robot.sample(64, torch.Generator().manual_seed(0)))
+    upright = bool(((rotation[:, 2, 2].abs() - 1.0).abs() < 1e-5).all())
+    flat = upright and bool((position[:, 2] - position[0, 2]).abs().max() < 1e-5)
+    given = f"{task.kind} in {task.name}"
+    if task.dimension == 2 and task.constraints > 2 and not upright:
+        raise ParameterError("task", given, f"SE(3) for {robot.name}, whose tool leaves the plane")
+    if task.dimension == 3 and flat:
+        raise ParameterError("task", given, f"two axes for {robot.name}, whose tool stays in a plane")
+
+
+def _check_reach(robot: Robot, task: TaskSpace, graph: TaskGraph) -> None:
+    """Warns where next to nothing of a graph lies within the arm's reach.
+
+    Raises:
+        ParameterError: Nothing does.
+    """
+    inside = int(within_reach(robot, task, graph.points).sum())
+    centre, radius = reach(robot)
+    place = ", ".join(f"{value:.3f}" for value in centre.tolist())
+    if inside == 0:
+        raise ParameterError("bounds", "no point within reach", f"points within {radius:.3f} m of ({place})")
+    if inside < 0.02 * len(graph.points):
+        text = f"only {inside} of {len(graph.points)} points lie within {radius:.3f} m of ({place}), the arm's reach"
+        warnings.warn(f"{text}: are the bounds in metres?", GrrWarning, stacklevel=4)
+
+
+def _complete(
+    robot: Robot,
+    task: TaskSpace | str | None,
+    points: int | TaskGraph | None,
+    bounds: Bounds | None,
+    seeds: SeedsLike | str | None,
+) -> Problem:
+    """Task, graph and seeds, with what was not given taken from the robot's preset."""
+    preset = robot.preset
+    kind = task.kind if isinstance(task, TaskSpace) else task or (preset.default_task if preset else None)
+    problem = preset.problems.get(kind or "") if preset else None
+    if isinstance(task, str) and preset and problem is None and bounds is None:
+        raise UnknownNameError("task", task, tuple(preset.problems))
+    if bounds is None and problem is not None:
+        bounds = problem.bounds
+    if points is None and problem is not None:
+        points = problem.points
+    if points is None or (bounds is None and not isinstance(points, TaskGraph)):
+        missing = "bounds" if points is not None else "points" if bounds is not None else "points and bounds"
+        raise ParameterError(missing, "nothing", f"they must be given for {robot.name}, which has no preset for this")
+    graph = points if isinstance(points, TaskGraph) else staggered_grid(bounds or (), points)
+    if seeds is None:
+        seeds = "auto" if problem is None else problem.seeds
+    if isinstance(seeds, str) and seeds != "auto":
+        raise UnknownNameError("seeds", seeds, ("auto",), " Or a table of configurations.")
+    if not isinstance(task, TaskSpace):
+        if kind is None:
+            raise ParameterError("task", "not given", "'position' or 'fixed-rotation'")
+        task = make_task(kind, graph.points.shape[1], problem.rotation if problem else None)
+    if graph.points.shape[1] != task.width:
+        raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.width} for {task.name}")
+    return Problem(task, graph, seeds)

@@ -1,0 +1,74 @@
+"""What a refinement changed: as a roadmap's parameters hold it, and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from grr_torch.resolution.objectives import OBJECTIVES
+from grr_torch.resolution.quality import Quality
+
+if TYPE_CHECKING:
+    from grr_torch.resolution.roadmap import Roadmap
+
+# what `parameters["refinement"]` keeps of the quality before
+BEFORE = ("resolved_vertices", "connected_edges", "smoothness", "triangles_wound", "triangles_spread")
+# figures of a map without edges or vertices
+_MAY_BE_NONE = {"smoothness", "smoothest", "mean", "worst"}
+
+
+def check_refinement(parameters: Mapping[str, Any]) -> None:
+    """Checks what a file says of a roadmap before its refinement.
+
+    Raises:
+        ValueError: A figure is missing or is no number.
+    """
+    before = parameters.get("refinement")
+    if before is None:
+        return
+    objectives = before.get("objectives", {}) if isinstance(before, dict) else None
+    if not isinstance(objectives, dict) or not set(objectives) <= set(OBJECTIVES):
+        raise ValueError("'refinement' without known objectives")
+    _demand_numbers("refinement", before, [*BEFORE, "seconds", *(["smoothest"] if objectives else [])])
+    for name, told in objectives.items():
+        _demand_numbers(name, told, ["weight"])
+        for when in ("before", "after"):
+            _demand_numbers(f"{name} {when}", told.get(when), ["mean", "worst"])
+
+
+def _demand_numbers(owner: str, table: Any, names: Sequence[str]) -> None:
+    for name in names:
+        number = int | float | None if name in _MAY_BE_NONE else int | float
+        if not isinstance(table, dict) or not isinstance(table.get(name, ""), number):
+            raise ValueError(f"'{owner}' without a number '{name}'")
+
+
+def summary(roadmap: Roadmap, quality: Quality) -> str:
+    """What the refinement of a roadmap changed, in one line; empty if it was not refined."""
+    before = roadmap.parameters.get("refinement")
+    if before is None:
+        return ""
+    named = (
+        ("vertices", "resolved_vertices"),
+        ("edges", "connected_edges"),
+        ("windings", "triangles_wound"),
+        ("spread triangles", "triangles_spread"),
+    )
+    changes = [f"{name} {before[key]:,} → {getattr(quality, key):,}" for name, key in named]
+    if before["smoothness"] is not None and quality.smoothness is not None:
+        changes.insert(0, f"smoothness {before['smoothness']:.3f} → {quality.smoothness:.3f}")
+    return ", ".join(changes) + f", in {before['seconds']:.2f} s"
+
+
+def traded(roadmap: Roadmap, quality: Quality) -> dict[str, str]:
+    """By objective, what was given for what against the map refined for smoothness alone; empty without objectives."""
+    told = roadmap.parameters.get("refinement") or {}
+    lines: dict[str, str] = {}
+    for name, figures in told.get("objectives", {}).items():
+        before, after = figures["before"], figures["after"]
+        if None not in (*before.values(), *after.values()):
+            values = [f"{which} {before[which]:.4g} → {after[which]:.4g}" for which in ("mean", "worst")]
+            lines[name] = f"{', '.join(values)} (weight {figures['weight']:g}; {OBJECTIVES[name]})"
+    if lines and told["smoothest"] is not None and quality.smoothness is not None:
+        lines["at the price of"] = f"smoothness {told['smoothest']:.3f} → {quality.smoothness:.3f} rad/m"
+    return lines
