@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.bench_teleop import teleop
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
 if TYPE_CHECKING:
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from grr_torch.robots.robot import Robot
 
 app = typer.Typer(name="bench", help="Measure: the tables of the README.", no_args_is_help=True)
+
+
+app.command()(teleop)
 
 
 @app.callback()

@@ -18,6 +18,8 @@ _SLOPE = 30.0
 _LEAST = 0.05
 # a radian of joint motion is made if it brings the tool so much nearer [m/rad]
 _WORTH = 0.05
+# a configuration farther than this from its neighbours' average is near full stretch [rad]
+_STRETCHED = 0.5
 # a vertex is gone to instead when it is so much nearer, as a share of the distance
 _NEARER = 0.8
 
@@ -46,7 +48,10 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     points = torch.cat([base[:, None], base[:, None] + steps], dim=1)
     columns, codes = solver.solve_columns(points.reshape(-1, width).T.contiguous())
     q = columns.T.reshape(count, points.shape[1], -1)
+    # near full stretch, much joint motion brings little
+    guesses = solver.guess(points.reshape(-1, width).cpu())[0].to(q).reshape(q.shape)
     fits = (codes <= 1).to(base.device).reshape(count, -1)
+    fits &= distance(q, guesses, solver.robot.continuous) <= _STRETCHED
     known = base_q.isfinite().all(1)
     reach = _SLOPE * (points - base[:, None]).norm(dim=2) + _LEAST
     moved = torch.where(known[:, None], distance(q, base_q[:, None].nan_to_num(), solver.robot.continuous), 0.0)

@@ -19,7 +19,7 @@ SUBSTEPS = 8
 # a line of more pieces is not followed at once
 _MOST_PIECES = 32
 # a gap between points on a line of so many ε is one to another posture, whatever joins them
-_WIDEST = 3.0
+_WIDEST = 2.0
 # of the longest step, so that what the projection adds seldom has to be cut off
 _SLACK = 0.98
 

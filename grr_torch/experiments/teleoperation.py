@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,6 +18,7 @@ from grr_torch.baselines.relaxed_ik import RelaxedIk
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.experiments.metrics import Figures, measure
 from grr_torch.experiments.paths import CLOSED, KINDS, draw_paths
+from grr_torch.output import atomic_write
 from grr_torch.progress import Progress, silent
 from grr_torch.resolution.build import build
 from grr_torch.resolution.roadmap import Roadmap
@@ -172,3 +175,51 @@ def _follow(
     progress(name, given + MORE_STEPS, given + MORE_STEPS)
     seconds = (time.perf_counter() - begin) / (len(trajectory) - 1) / count
     return torch.stack(trajectory, dim=1).cpu(), seconds
+
+
+def aggregate(runs: Sequence[Run]) -> list[dict[str, float | str | int | None]]:
+    """Each run's metrics over its paths: means, and the largest joint step, acceleration, closure and stall.
+
+    `deviation_solved` and `smoothness_solved` are means over the paths of a kind on which all methods succeed; None
+    where there is no such path.
+    """
+    solved = {
+        kind: torch.stack([run.figures.success for run in runs if run.kind == kind]).all(0)
+        for kind in {run.kind for run in runs}
+    }
+    results: list[dict[str, float | str | int | None]] = []
+    for run in runs:
+        figures, common = run.figures, solved[run.kind]
+        results.append(
+            {
+                "kind": run.kind,
+                "method": run.method,
+                "paths": len(run.waypoints),
+                "success": float(figures.success.double().mean()),
+                "deviation": float(figures.deviation.mean()),
+                "deviation_solved": float(figures.deviation[common].mean()) if bool(common.any()) else None,
+                "tilt": float(figures.tilt.mean()),
+                "smoothness": float(figures.smoothness.mean()),
+                "smoothness_solved": float(figures.smoothness[common].mean()) if bool(common.any()) else None,
+                "joint_step": float(figures.joint_step.max()),
+                "acceleration": float(figures.acceleration.max()),
+                "closure": float(figures.closure.max()) if run.kind in CLOSED else None,
+                "stall": float(figures.stall.max()),
+                "step_seconds": run.step_seconds,
+            }
+        )
+    return results
+
+
+def save_trajectories(runs: Sequence[Run], path: str | os.PathLike[str]) -> None:
+    """Writes joint trajectories, and the waypoints they followed, to an npz file by an atomic rename.
+
+    One array METHOD__KIND of shape (paths, steps, n) for each run, and one KIND (paths, waypoints, width).
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    arrays = {f"{run.method}__{run.kind}": run.trajectories.numpy() for run in runs}
+    arrays |= {run.kind: run.waypoints.cpu().numpy() for run in runs}
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
