@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix
@@ -52,7 +54,7 @@ def _cut(finder: WayFinder, ways: list[Way]) -> list[Way]:
     for way in ways:
         parts = max(1, min(round(way.length(finder.solver.robot.continuous) / share), len(way.points) - 1))
         knots = np.linspace(0, len(way.points) - 1, parts + 1).round().astype(int).tolist()
-        for a, b in zip(knots, knots[1:], strict=False):
+        for a, b in pairwise(knots):
             pieces.append(Way(way.points[a : b + 1], way.configurations[a : b + 1], way.straight))
     return pieces
 
@@ -78,4 +80,4 @@ def _round(finder: WayFinder, pieces: list[Way]) -> list[Way]:
     path = [len(knots) - 1]
     while path[0]:
         path.insert(0, int(before[path[0]]))
-    return [every[pair] for pair in zip(path, path[1:], strict=False)]
+    return [every[pair] for pair in pairwise(path)]

@@ -126,15 +126,16 @@ class WayFinder:
         way, points, q = self._bisect(starts, ends, middle)
         counts = way.bincount(minlength=len(starts)).tolist()
         ways = [
-            Way(p, c, straight) if len(p) else None
-            for p, c in zip(points.split(counts), q.split(counts), strict=True)
+            Way(p, c, straight) if len(p) else None for p, c in zip(points.split(counts), q.split(counts), strict=True)
         ]
         return self._free(ways)
 
     def _bisect(self, starts: Stops, ends: Stops, middle: _Middle) -> tuple[Tensor, Tensor, Tensor]:
         """The line (M,), point (M, width) and configuration (M, n) of all waypoints of the lines that have a way."""
         wraps = self.solver.robot.continuous[:, None]
-        columns = [part.T.contiguous() for part in (starts.points, ends.points, starts.configurations, ends.configurations)]
+        columns = [
+            part.T.contiguous() for part in (starts.points, ends.points, starts.configurations, ends.configurations)
+        ]
         count = len(starts)
         found = torch.ones(count, dtype=torch.bool, device=columns[0].device)
         way = torch.arange(count, device=columns[0].device)
@@ -183,7 +184,6 @@ class WayFinder:
 
 
 def substeps(q: Tensor, continuous: Tensor) -> Tensor:
-    """Configurations (K − 1, S, n) between neighbours of (K, n), as a controller comes through them; the last one is
-    the neighbour itself."""
+    """Configurations (K − 1, S, n) between neighbours of (K, n), each neighbour being the last of its own."""
     fractions = torch.arange(1, SUBSTEPS + 1, dtype=q.dtype, device=q.device) / SUBSTEPS
     return q[:-1, None] + fractions[:, None] * difference(q[:-1], q[1:], continuous)[:, None]
