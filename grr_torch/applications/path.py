@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
+from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from grr_torch.applications.retime import retime
 from grr_torch.applications.ways import Way, substeps
+from grr_torch.errors import ParameterError
 from grr_torch.spaces.configuration import difference, distance
+from grr_torch.tables import AXES, table_writer, unique_names
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -71,6 +76,23 @@ def path_of(roadmap: Roadmap, ways: list[Way], velocity_limits: Tensor, accelera
     largest, mean = _deviation(roadmap, ways)
     times = retime(q.cpu(), velocity_limits, acceleration_limits)
     return Path(points.cpu(), q.cpu(), times, _passed(roadmap, ways), largest, mean)
+
+
+def save_path(roadmap: Roadmap, path: Path, file: str | os.PathLike[str]) -> None:
+    """Writes a row for each waypoint: time, coordinates, joints; an .npz has `vertices` and `joint_names` as well.
+
+    Raises:
+        ParameterError: There is no path, or the file does not end in .csv, .npy, .npz or .parquet.
+        OutputError: It cannot be written.
+    """
+    if not path.found:
+        raise ParameterError("path", path.reason, "one that was found")
+    axes = AXES[: roadmap.task.width]
+    joints = unique_names(roadmap.robot.joint_names, (*axes, "time"))
+    columns = {"times": ["time"], "points": axes, "configurations": joints}
+    constants = {"vertices": path.vertices.numpy(), "joint_names": np.array(roadmap.robot.joint_names)}
+    with table_writer(FilePath(file), columns, len(path.times), constants) as write:
+        write({name: getattr(path, name).numpy() for name in columns})
 
 
 def no_path(roadmap: Roadmap, reason: str) -> Path:

@@ -20,7 +20,7 @@ from grr_torch.spaces.task import TaskSpace
 if TYPE_CHECKING:
     import networkx
 
-    from grr_torch.applications.plan import Path
+    from grr_torch.applications.path import Path
     from grr_torch.applications.solve import Solution, Solver
 
 
