@@ -116,7 +116,7 @@ def _show(roadmap: Roadmap, path: Path, files: list[str], as_json: bool) -> None
         print_json({"found": True, **figures, "files": files})
         return
     rows = [
-        ("waypoints", f"{len(path.times):,}, over {len(path.vertices)} vertices of the roadmap"),
+        ("waypoints", f"{len(path.times):,}, vertices of the roadmap on it: {len(path.vertices)}"),
         ("length", f"{path.task_length:.4f} m in task space, {path.joint_length:.4f} rad in joint space"),
         ("duration", f"{path.duration:.3f} s"),
         ("deviation", f"{1e3 * path.max_deviation:.3f} mm at most, {1e3 * path.mean_deviation:.3f} mm on average"),

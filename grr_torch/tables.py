@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from csv import reader as csv_rows
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from grr_torch.errors import FileFormatError, ParameterError
 from grr_torch.output import atomic_write
 
 # rows of a piece
-PIECE = 1 << 16
+PIECE = 1 << 14
 AXES = ("x", "y", "z")
 _READS = (".csv", ".npy", ".parquet")
 _WRITES = (".csv", ".npy", ".npz", ".parquet")
@@ -116,18 +117,18 @@ def _read_csv(path: Path, width: int) -> Iterator[Array]:
     from pyarrow import csv, float64
 
     with path.open(encoding="utf-8-sig") as file:
-        first = next((line.strip() for line in file if line.strip()), "")
+        above, first = next(((k, line.strip()) for k, line in enumerate(file) if line.strip()), (0, ""))
     if not first:
         return
     delimiter = next((mark for mark in _DELIMITERS if mark in first), ",")
-    cells = [cell.strip().strip('"') for cell in first.split(delimiter)]
+    cells = [cell.strip() for cell in next(csv_rows([first], delimiter=delimiter))]
     header = not all(map(_is_number, cells))
     names = cells if header else [str(k) for k in range(len(cells))]
     wanted = _wanted(path, names, width)
     reader = csv.open_csv(
         path,
         # a header is skipped, so that names are those that were found here
-        read_options=csv.ReadOptions(column_names=names, skip_rows=int(header), block_size=1 << 20),
+        read_options=csv.ReadOptions(column_names=names, skip_rows=above + 1 if header else 0, block_size=1 << 20),
         parse_options=csv.ParseOptions(delimiter=delimiter),
         convert_options=csv.ConvertOptions(include_columns=wanted, column_types=dict.fromkeys(wanted, float64())),
     )
@@ -178,7 +179,7 @@ def _write_arrow(path: Path, columns: Columns, suffix: str) -> Iterator[Callable
             values = [part for group in columns for part in _parts(arrays[group])]
             table = pyarrow.table([pyarrow.array(np.ascontiguousarray(part)) for part in values], names=names)
             if writer is None:
-                quotes = "needed" if set(",\"\r\n") & set("".join(names)) else "none"
+                quotes = "needed" if set(',"\r\n') & set("".join(names)) else "none"
                 plain = csv.WriteOptions(quoting_style=quotes, quoting_header=quotes)
                 writer = (
                     csv.CSVWriter(path, table.schema, write_options=plain)

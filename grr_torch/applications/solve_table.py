@@ -47,10 +47,8 @@ def solve_table(
     done = 0
     with table_writer(out, columns, count, {"joint_names": np.array(roadmap.robot.joint_names)}) as write:
         for piece in pieces:
-            before = done
-            solution = roadmap.solve(
-                torch.from_numpy(piece), progress=lambda stage, k, _, before=before: progress(stage, before + k, count)
-            )
+            progress("solving", done, count)
+            solution = roadmap.solve(torch.from_numpy(piece))
             write(
                 {
                     "points": piece,
@@ -62,4 +60,5 @@ def solve_table(
             for status, number in zip(*np.unique(solution.status, return_counts=True), strict=True):
                 counts[str(status)] += int(number)
             done += len(piece)
+    progress("solving", count, count)
     return {status: number for status, number in counts.items() if number}
