@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import minimum_spanning_tree
 
 import grr_torch
 from grr_torch.applications.plan import Planner
@@ -103,6 +106,27 @@ def test_every_connected_edge_can_be_followed(roadmap):
     planner = Planner(roadmap)
     first, second = (planner._vertices(ends) for ends in roadmap.edges[roadmap.connected].T)
     assert all(way is not None for way in planner.ways.on_lines(first, second))
+
+
+def test_where_the_averages_do_not_follow_the_edges_paths_do(roadmap):
+    """Of a tree of edges alone, the map's averages are poor."""
+    first, second = roadmap.edges.T
+    lengths = distance(roadmap.configurations[first], roadmap.configurations[second], roadmap.robot.continuous)
+    weights = np.where(roadmap.connected, lengths.numpy() + 1e-6, 0.0)
+    size = len(roadmap.points)
+    tree = minimum_spanning_tree(csr_matrix((weights, (first.numpy(), second.numpy())), shape=(size, size)))
+    kept = {frozenset(pair) for pair in zip(*(index.tolist() for index in tree.nonzero()), strict=True)}
+    inside = torch.tensor([frozenset(pair) in kept for pair in roadmap.edges.tolist()])
+    thin = replace(roadmap, connected=roadmap.connected & inside)
+    planner = Planner(thin)
+    ends = [planner._vertices(vertices) for vertices in thin.edges[thin.connected].T]
+    assert any(way is None for way in planner.ways.on_map(*ends))
+    part = Routes(thin).part
+    generator = torch.Generator().manual_seed(17)
+    vertices = thin.solver.vertices[torch.randint(len(thin.solver.vertices), (12,), generator=generator)]
+    for a, b in vertices.reshape(-1, 2).tolist():
+        if part[a] == part[b]:
+            assert_is_a_path(thin, thin.plan(thin.points[a], thin.points[b]))
 
 
 def test_the_deviation_is_that_of_the_tool_from_its_straight_lines(roadmap):
