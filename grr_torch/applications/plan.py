@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 _ENTRIES = (8, 64, 512)
 # times that an edge which turns out to be blocked is gone round
 _DETOURS = 20
-# the shortest step that may be asked for [rad]
-_LEAST_STEP = 1e-3
+# the shortest step that may be asked for [rad]: what the projection leaves open is not small beside shorter ones
+_LEAST_STEP = 5e-3
 
 
 class _Refusal(NamedTuple):
