@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 import grr_torch
 from grr_torch.applications.plan import Planner
-from grr_torch.applications.retime import accelerations, retime
+from grr_torch.applications.retime import accelerations
 from grr_torch.applications.routes import Routes
 from grr_torch.errors import ParameterError
 from grr_torch.spaces.configuration import distance
@@ -255,16 +255,6 @@ def test_acceleration_limits_hold_from_rest_to_rest(roadmap, smooth):
     assert_is_a_path(roadmap, path, velocity=torch.tensor(0.7))
     assert bool((accelerations(path.configurations, path.times).abs() <= limits * (1.0 + 1e-6)).all())
     assert path.duration >= roadmap.plan(start, goal, smooth=smooth, velocity_limits=0.7).duration
-
-
-def test_a_straight_line_takes_the_time_of_a_trapezoidal_profile():
-    q = torch.linspace(0.0, 3.0, 121, dtype=torch.float64)[:, None] * torch.tensor([1.0, -0.4], dtype=torch.float64)
-    speed, acceleration = torch.tensor([1.5, 1.5]).double(), torch.tensor([2.0, 4.0]).double()
-    times = retime(q, speed, acceleration)
-    assert times[-1].item() == pytest.approx(3.0 / 1.5 + 1.5 / 2.0, rel=1e-3)
-    assert retime(q, speed)[-1].item() == pytest.approx(2.0)
-    two = retime(q[[0, -1]], speed, acceleration)
-    assert bool((accelerations(q[[0, -1]], two).abs() <= acceleration * (1.0 + 1e-6)).all())
 
 
 def test_bad_input_is_refused(roadmap):

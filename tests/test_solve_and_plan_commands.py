@@ -1,4 +1,4 @@
-"""`grr-torch solve` and `grr-torch plan`, and the tables that they read and write."""
+"""`grr-torch solve` and `grr-torch plan`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from grr_torch.cli.main import run as run_command
 
 import grr_torch
 from grr_torch.applications.path import save_path
-from grr_torch.errors import FileFormatError, ParameterError
+from grr_torch.errors import ParameterError
 from grr_torch.recording.plan import record_plan
-from grr_torch.tables import read_points, table_writer
+from grr_torch.tables import read_points
 
 NAMES = ["x", "y", *(f"joint_{k}" for k in range(1, 6)), "valid", "status"]
 
@@ -102,22 +102,6 @@ def test_files_of_points_are_solved_row_by_row(command, planar_roadmap, points, 
     assert {"solved", "outside"} <= set(counts)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "\n\n x ; y ; z\n0.25;-0.5;7\n",
-        "0.25\t-0.5\n\n",
-        "\ufeff0.25,-5e-1",
-        '"y","x"\r\n-0.5,0.25\r\n',
-        "y,x,name\n-0.5,0.25,a\n",
-    ],
-)
-def test_csv_files_are_read_as_people_write_them(tmp_path, text):
-    (tmp_path / "p.csv").write_text(text, encoding="utf-8", newline="")
-    (piece,) = read_points(tmp_path / "p.csv", 2)
-    np.testing.assert_array_equal(piece, [[0.25, -0.5]])
-
-
 def test_what_is_written_can_be_read_as_points_again(command, points, tmp_path):
     write_points(tmp_path / "p.npy", points)
     before = "p.npy"
@@ -140,40 +124,6 @@ def test_points_on_the_command_line_are_shown(command, planar_roadmap):
     assert (first["valid"], first["status"]) == (True, "solved")
     assert (second["configuration"], second["valid"], second["status"]) == (None, False, "outside")
     assert json.loads(shown)["counts"] == {"solved": 1, "outside": 1}
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".npy", ".parquet"])
-def test_tables_read_back_what_was_written_in_any_pieces(tmp_path, suffix):
-    generator = np.random.default_rng(1)
-    values = generator.standard_normal((40_000, 3)) * 10.0 ** generator.integers(-9, 9, (40_000, 3))
-    cuts = np.sort(generator.integers(1, len(values), 5))
-    file = tmp_path / f"t{suffix}"
-    with table_writer(file, {"points": ["x", "y", "z"], "status": ["a, b"]}, len(values)) as write:
-        for part in np.split(values, cuts):
-            write({"points": part, "status": np.full(len(part), "too far")})
-    pieces = list(read_points(file, 3))
-    assert len(pieces) > 1
-    np.testing.assert_array_equal(np.concatenate(pieces), values)
-
-
-def write_and_stop(path):
-    with table_writer(path, {"points": ["x", "y"]}, 10) as write:
-        write({"points": np.zeros((5, 2))})
-        raise RuntimeError("stop")
-
-
-def test_a_table_that_fails_half_way_leaves_nothing(tmp_path):
-    for suffix in (".csv", ".npy", ".npz", ".parquet"):
-        with pytest.raises(RuntimeError, match="stop"):
-            write_and_stop(tmp_path / f"t{suffix}")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_joint_named_like_a_coordinate_gets_a_column_of_its_own():
-    from grr_torch.tables import unique_names
-
-    assert unique_names(("x", "turn"), ("x", "y")) == ["joint x", "joint turn"]
-    assert unique_names(("a", "b"), ("x", "y")) == ["a", "b"]
 
 
 def bad_files(folder):
@@ -332,8 +282,3 @@ def test_what_was_not_found_is_not_written(planar_roadmap, tmp_path):
 def test_names_are_exported():
     for name in ("Path", "Solution", "Teleoperator", "Command"):
         assert getattr(grr_torch, name).__name__ == name
-
-
-def test_points_of_a_file_must_be_there(tmp_path):
-    with pytest.raises(FileFormatError, match="is not a file"):
-        next(read_points(tmp_path / "p.csv", 2))

@@ -141,8 +141,8 @@ class Roadmap:
             start_configuration: (n,) configuration [rad or m], instead of `start`; the path begins at its very values.
             goal_configuration: (n,) configuration, instead of `goal`; met modulo 2π.
             smooth: Shorten it by straight task-space lines on the map.
-            step: D_q below which neighbouring waypoints stay [rad], from 0.005 to 0.05 √n. The shorter, the longer an arm
-                with acceleration limits takes round the corners.
+            step: D_q below which neighbouring waypoints stay [rad], from 0.005 to 0.05 √n. The shorter, the longer an
+                arm with acceleration limits takes round the corners.
             velocity_limits: Of the joints [rad/s or m/s], one number or (n,); by default the robot's, and 1 where it
                 has none.
             acceleration_limits: Of the joints [rad/s² or m/s²], one number or (n,); by default none. With them, the
