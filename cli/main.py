@@ -10,8 +10,10 @@ import typer
 from grr_torch.cli.bench import app as bench
 from grr_torch.cli.build import build
 from grr_torch.cli.info import info
+from grr_torch.cli.plan import plan
 from grr_torch.cli.robots import robots
 from grr_torch.cli.smm import smm
+from grr_torch.cli.solve import solve
 from grr_torch.cli.spheres import spheres
 from grr_torch.cli.view import view
 
@@ -26,7 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for command in (robots, build, info, view, spheres, smm):
+for command in (robots, build, info, view, solve, plan, spheres, smm):
     app.command()(command)
 app.add_typer(bench)
 
@@ -55,14 +57,18 @@ def run(arguments: Sequence[str] | None = None) -> None:
     app(join_bounds(list(sys.argv[1:] if arguments is None else arguments)), prog_name="grr-torch")
 
 
+# options that take as many numbers as follow
+_OF_NUMBERS = ("--bounds", "--point", "--start", "--goal", "--start-configuration", "--goal-configuration")
+
+
 def join_bounds(arguments: list[str]) -> list[str]:
-    """Puts the numbers after --bounds or --point into one argument: an option takes a fixed number otherwise."""
+    """Puts the numbers after --bounds, --point and their like into one argument: typer takes a fixed number else."""
     joined: list[str] = []
     position = 0
     while position < len(arguments):
         joined.append(arguments[position])
         position += 1
-        if joined[-1] in ("--bounds", "--point"):
+        if joined[-1] in _OF_NUMBERS:
             numbers: list[str] = []
             while position < len(arguments) and _is_number(arguments[position]):
                 numbers.append(arguments[position])

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ParamSpec, TextIO, TypeVar
 
 import typer
 
-from grr_torch.errors import GrrError, GrrWarning
+from grr_torch.errors import GrrError, GrrWarning, ParameterError
 from grr_torch.progress import Progress
 
 P = ParamSpec("P")
@@ -87,6 +88,21 @@ def _cells_row(name: str, quality: dict[str, Any]) -> tuple[str, str]:
     certified, wound, spread = (quality[f"{name}_{figure}"] for figure in ("certified", "wound", "spread"))
     text = f"{100.0 * certified:.2f} % of {quality[name]:,}; {wound} with a winding, {spread} spread by more than 1 rad"
     return f"certified {name}", text
+
+
+def numbers(option: str, text: str, names: Sequence[str]) -> list[float]:
+    """The numbers that an option takes, one for each name.
+
+    Raises:
+        ParameterError: They are not so many finite numbers.
+    """
+    try:
+        values = [float(value) for value in text.replace(",", " ").split()]
+    except ValueError:
+        values = []
+    if len(values) != len(names) or not all(map(math.isfinite, values)):
+        raise ParameterError(option, repr(text), f"{len(names)} finite numbers: {' '.join(names)}")
+    return values
 
 
 def markdown_table(head: list[str], rows: list[list[str]]) -> str:

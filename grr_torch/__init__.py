@@ -9,7 +9,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from grr_torch.applications.path import Path
     from grr_torch.applications.self_motion import SelfMotionManifold, self_motion_manifold
+    from grr_torch.applications.solve import Solution
+    from grr_torch.applications.teleoperate import Command, Teleoperator
     from grr_torch.errors import GrrError, GrrWarning
     from grr_torch.projection.continuity import is_continuous
     from grr_torch.projection.project import Tolerances, project
@@ -27,6 +30,10 @@ if TYPE_CHECKING:
 _HOMES = {
     "SelfMotionManifold": "applications.self_motion",
     "self_motion_manifold": "applications.self_motion",
+    "Path": "applications.path",
+    "Solution": "applications.solve",
+    "Command": "applications.teleoperate",
+    "Teleoperator": "applications.teleoperate",
     "GrrError": "errors",
     "GrrWarning": "errors",
     "is_continuous": "projection.continuity",
@@ -50,16 +57,20 @@ _HOMES = {
 }
 
 __all__ = [
+    "Command",
     "FixedRotation",
     "GrrError",
     "GrrWarning",
+    "Path",
     "Position",
     "Roadmap",
     "Robot",
     "SelfMotionManifold",
+    "Solution",
     "SphereModel",
     "TaskGraph",
     "TaskSpace",
+    "Teleoperator",
     "Tolerances",
     "__version__",
     "build",

@@ -242,7 +242,7 @@ def test_ctrl_c_leaves_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("command", [[], ["build"], ["info"], ["view"], ["robots"], ["spheres"]])
+@pytest.mark.parametrize("command", [[], ["build"], ["info"], ["view"], ["solve"], ["plan"], ["robots"], ["spheres"]])
 def test_help_has_an_example(tmp_path, command):
     result = run(*command, "--help", cwd=tmp_path)
     assert result.returncode == 0
@@ -262,4 +262,9 @@ def test_the_numbers_after_bounds_become_one_argument():
     assert join_bounds(["build", "--bounds", "-1", "1", "-2e-1", ".5", "--points", "3"]) == [
         "build", "--bounds=-1 1 -2e-1 .5", "--points", "3",
     ]  # fmt: skip
+    assert join_bounds(["--start", "0", "-1", "--goal", "2", "3", "--smooth"]) == [
+        "--start=0 -1",
+        "--goal=2 3",
+        "--smooth",
+    ]
     assert join_bounds(["--bounds", "-1 1 0 2"]) == ["--bounds", "-1 1 0 2"]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
+from torch import Tensor
 
 from grr_torch.spaces.configuration import distance
 
@@ -25,8 +26,14 @@ class Routes:
         part: (V,) the connected part of the roadmap that a vertex lies in.
     """
 
-    def __init__(self, roadmap: Roadmap) -> None:
-        first, second = roadmap.edges[roadmap.connected].T
+    def __init__(self, roadmap: Roadmap, open_edges: Tensor | None = None) -> None:
+        """Makes the graph.
+
+        Args:
+            roadmap: The roadmap.
+            open_edges: (E,) bool, the edges that routes may take; by default the connected ones.
+        """
+        first, second = roadmap.edges[roadmap.connected if open_edges is None else open_edges].T
         q = roadmap.configurations
         lengths = distance(q[first], q[second], roadmap.robot.continuous.cpu()).numpy()
         vertices = len(roadmap.points)

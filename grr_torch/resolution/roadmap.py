@@ -20,6 +20,7 @@ from grr_torch.spaces.task import TaskSpace
 if TYPE_CHECKING:
     import networkx
 
+    from grr_torch.applications.path import Path
     from grr_torch.applications.solve import Solution, Solver
 
 
@@ -122,6 +123,59 @@ class Roadmap:
             ParameterError: The width is not the task's, a value is not finite, or no vertex is resolved.
         """
         return self.solver(points, progress=progress)
+
+    def plan(
+        self,
+        start: Tensor | None = None,
+        goal: Tensor | None = None,
+        *,
+        start_configuration: Tensor | None = None,
+        goal_configuration: Tensor | None = None,
+        smooth: bool = False,
+        step: float = 0.05,
+        velocity_limits: float | Tensor | None = None,
+        acceleration_limits: float | Tensor | None = None,
+    ) -> Path:
+        """A path over the map: the shortest along connected edges by D_q (Section IV-E of the paper).
+
+        Its waypoints lie on the edges, each solved by the map, and where the map's averages do not follow an edge,
+        projected along it as in the continuity check. Neighbours are less than `step` apart, and the straight motion
+        between them is free of self-collision. Configurations off the map join it at near vertices, along a
+        task-space line where the task is met, else through joint space.
+
+        Args:
+            start: (width,) point [m].
+            goal: (width,) point [m].
+            start_configuration: (n,) configuration [rad or m], instead of `start`; the path begins at its very values.
+            goal_configuration: (n,) configuration, instead of `goal`; met modulo 2π.
+            smooth: Shorten it by straight task-space lines on the map.
+            step: D_q below which neighbouring waypoints stay [rad], from 0.005 to 0.05 √n. The shorter, the longer an
+                arm with acceleration limits takes round the corners.
+            velocity_limits: Of the joints [rad/s or m/s], one number or (n,); by default the robot's, and 1 where it
+                has none.
+            acceleration_limits: Of the joints [rad/s² or m/s²], one number or (n,); by default none. With them, the
+                path begins and ends at rest.
+
+        Returns:
+            The path; if there is none, `found` is false and `reason` says why.
+
+        Raises:
+            ParameterError: A shape or parameter is not valid, a value is not finite, a start or goal is given twice
+                or not at all, or no vertex is resolved.
+        """
+        from grr_torch.applications.plan import plan
+
+        return plan(
+            self,
+            start,
+            goal,
+            start_configuration=start_configuration,
+            goal_configuration=goal_configuration,
+            smooth=smooth,
+            step=step,
+            velocity_limits=velocity_limits,
+            acceleration_limits=acceleration_limits,
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the roadmap to one safetensors file (`.grr`), by an atomic rename.
