@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import math
 
 import torch
 from torch import Tensor
@@ -13,11 +13,14 @@ from grr_torch.spaces.configuration import distance
 # metres around the last such point that are searched in a step, and the shares of it that are tried
 _AROUND = 0.05
 _SHARES = (1.0, 0.4, 0.15, 0.05)
+# directions across, in space, and how much they lean to the target
+_SIDES = 8
+_LEANS = (0.5, 0.0, -0.5)
 # a step between neighbouring points may change the configuration by so much a metre [rad/m], and so much in all [rad]
 _SLOPE = 30.0
 _LEAST = 0.05
 # a radian of joint motion is made if it brings the tool so much nearer [m/rad]
-_WORTH = 0.05
+_WORTH = 0.02
 # a configuration farther than this from its neighbours' average is near full stretch [rad]
 _STRETCHED = 0.5
 # a vertex is gone to instead when it is so much nearer, as a share of the distance
@@ -27,8 +30,8 @@ _NEARER = 0.8
 def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
     """One step of a search for the solvable point nearest to each target.
 
-    Points round the last one found are solved, towards the target and in the directions of a grid. The nearest to
-    the target is taken if the map leads there without a jump. Where a resolved vertex is much nearer to the target,
+    Points round the last one found are solved, towards the target and across. The nearest to the target is taken if the
+    map leads there without a jump. Where a resolved vertex is much nearer to the target,
     as on the other side of a hole, that is taken.
 
     Args:
@@ -41,9 +44,8 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
         Points (B, width) and configurations (B, n).
     """
     count, width = base.shape
-    directions = torch.cat([targets - base, *_directions(base)], dim=1).reshape(count, -1, width)
     apart = (targets - base).norm(dim=1).clamp_max(_AROUND)
-    directions = directions / directions.norm(dim=2, keepdim=True).clamp_min(1e-12) * apart[:, None, None]
+    directions = apart[:, None, None] * _directions(targets - base)
     steps = torch.cat([share * directions for share in _SHARES], dim=1)
     points = torch.cat([base[:, None], base[:, None] + steps], dim=1)
     columns, codes = solver.solve_columns(points.reshape(-1, width).T.contiguous())
@@ -72,8 +74,18 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     )
 
 
-def _directions(base: Tensor) -> list[Tensor]:
-    """Unit directions to a grid's neighbours: along the axes, and through the corners and edges of its cells."""
-    d = base.shape[1]
-    offsets = [offset for offset in itertools.product((-1.0, 0.0, 1.0), repeat=d) if any(offset)]
-    return [base.new_tensor(offset).expand(len(base), -1) for offset in offsets]
+def _directions(towards: Tensor) -> Tensor:
+    """Unit directions (B, K, d): towards a target, and across, leaning to and from it."""
+    ahead = torch.nn.functional.normalize(towards, dim=1)
+    if towards.shape[1] == 2:
+        side = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=1)
+        sides = torch.stack([side, -side], dim=1)
+    else:
+        # any axis that is not parallel
+        axis = torch.nn.functional.one_hot(ahead.abs().argmin(1), 3).to(ahead)
+        first = torch.nn.functional.normalize(torch.linalg.cross(ahead, axis), dim=1)
+        second = torch.linalg.cross(ahead, first)
+        angles = torch.arange(_SIDES, dtype=ahead.dtype, device=ahead.device)[:, None] * (2.0 * math.pi / _SIDES)
+        sides = angles.cos() * first[:, None] + angles.sin() * second[:, None]
+    leaning = [torch.nn.functional.normalize(sides + lean * ahead[:, None], dim=2) for lean in _LEANS]
+    return torch.cat([ahead[:, None], *leaning], dim=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -234,7 +235,7 @@ class Pilot:
         return rejoin(self.follower, arms.q[arm], ends[ends.isfinite().all(1)])
 
 
-def _ahead(vertex: int, following: object) -> list[int]:
+def _ahead(vertex: int, following: np.ndarray) -> list[int]:
     """A vertex and the next two on the way from it."""
     path = [vertex]
     while len(path) < 3 and following[path[-1]] >= 0:

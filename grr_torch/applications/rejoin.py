@@ -12,6 +12,8 @@ from grr_torch.spaces.configuration import difference
 _CHECKED = 48
 # an arm so near [rad or m] to one of the configurations is there
 _ARRIVED = 1e-6
+# directions out of a contact, how many of the best of them are looked at closely, and the longest motion [rad or m]
+_DIRECTIONS, _TRIED, _LONGEST = 512, 16, 0.1
 # of a step, what is tried where all of it would go deeper
 _SHARES = (1.0, 0.5, 0.2, 0.05)
 
@@ -20,7 +22,7 @@ def rejoin(follower: Follower, q: Tensor, ends: Tensor) -> Tensor | None:
     """One control step (n,) of an arm that stands at q (n,) towards the nearest of some configurations (K, n).
 
     A configuration counts if the straight way to it is free of self-collision, or, from a contact, never goes
-    deeper than the arm is already. If there is none, an arm in contact moves straight out of it.
+    deeper than the arm is already. If there is none, an arm in contact moves out of it where it gains most.
 
     Returns:
         The configuration after the step; None if there is no such way.
@@ -47,19 +49,21 @@ def clearance(follower: Follower, q: Tensor) -> Tensor:
 
 
 def leave_contact(follower: Follower, q: Tensor) -> Tensor | None:
-    """One control step (n,) along which the clearance grows fastest; None if it does not grow."""
-    with torch.enable_grad():
-        variable = q.clone().requires_grad_()
-        (gradient,) = torch.autograd.grad(follower.robot.self_collision_distance(variable), variable)
-    if not bool(gradient.isfinite().all()) or float(gradient.abs().max()) < 1e-9:
-        return None
-    unit = gradient / gradient.abs().max()
-    steps = q + unit.new_tensor(_SHARES)[:, None] * unit * follower.longest.clamp_max(0.1).min()
-    steps = torch.minimum(
-        torch.maximum(steps, torch.minimum(follower.robot.lower, q)), torch.maximum(follower.robot.upper, q)
-    )
-    fits = never_deeper(follower, q.expand_as(steps), steps).nonzero()[:, 0]
-    return steps[fits[0]] if len(fits) else None
+    """One control step (n,) that gains clearance and loses none on the way; None if no such step was found.
+
+    The clearance is the least of many distances: where two of them are equal its gradient leads from one contact into
+    the other, so of many directions, always the same, the best is taken.
+    """
+    robot = follower.robot
+    drawn = torch.randn(_DIRECTIONS, len(q), dtype=q.dtype, generator=torch.Generator().manual_seed(0)).to(q)
+    reach = follower.longest.clamp_max(_LONGEST).min()
+    moves = torch.cat([share * reach * drawn / drawn.abs().amax(1, keepdim=True) for share in _SHARES])
+    # not out of a limit, nor farther out of one
+    ends = torch.minimum(torch.maximum(q + moves, torch.minimum(robot.lower, q)), torch.maximum(robot.upper, q))
+    gained = clearance(follower, ends) - clearance(follower, q[None])
+    best = gained.argsort(descending=True)[:_TRIED]
+    fits = (never_deeper(follower, q.expand(len(best), -1), ends[best]) & (gained[best] > 0.0)).nonzero()[:, 0]
+    return ends[best[fits[0]]] if len(fits) else None
 
 
 def never_deeper(follower: Follower, q: Tensor, ends: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from grr_torch.errors import ParameterError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, point_columns, project, project_columns
-from grr_torch.resolution.build import check_task
+from grr_torch.resolution.problem import check_task
 from grr_torch.resolution.reachability import reach
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.robot import Robot

@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import grr_torch
+from grr_torch.applications.solve import STATUSES
+from grr_torch.errors import ParameterError
+from grr_torch.resolution.cells import triangles
+
+
+@pytest.fixture(scope="module")
+def kinova_roadmap(kinova) -> grr_torch.Roadmap:
+    return grr_torch.build(kinova, "fixed-rotation")
+
+
+@pytest.fixture(scope="module", params=["planar", "kinova"])
+def roadmap(request, planar_roadmap, kinova_roadmap) -> grr_torch.Roadmap:
+    return planar_roadmap if request.param == "planar" else kinova_roadmap
+
+
+def _inside(roadmap: grr_torch.Roadmap, count: int) -> torch.Tensor:
+    """Random points of the triangles whose edges are all connected."""
+    corners = triangles(roadmap.edges[roadmap.connected], len(roadmap.points))
+    generator = torch.Generator().manual_seed(0)
+    chosen = corners[torch.randint(len(corners), (count,), generator=generator)]
+    weights = -torch.rand(count, 3, 1, dtype=torch.float64, generator=generator).log()
+    return (roadmap.points[chosen] * weights).sum(1) / weights.sum(1)
+
+
+def test_what_is_valid_is_at_its_point_within_limits_and_free(roadmap):
+    low, high = roadmap.points.amin(0) - 0.1, roadmap.points.amax(0) + 0.1
+    points = low + (high - low) * torch.rand(
+        2000, len(low), dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
+    solution = roadmap.solve(points)
+    q = solution.configurations[solution.valid]
+    robot, task = roadmap.robot, roadmap.task
+    position, rotation = robot.forward_kinematics(q)
+    residuals = task.residuals(task.error(points[solution.valid].T, position.T, rotation.permute(1, 2, 0)))
+    assert 0 < len(q) < len(points)
+    assert float(residuals[0].max()) <= 1e-4
+    assert len(residuals[1]) == 0 or float(residuals[1].max()) <= 1e-3
+    assert bool(robot.within_limits(q).all())
+    assert not bool(robot.in_self_collision(q).any())
+    assert bool(solution.configurations[~solution.valid].isnan().all())
+
+
+def test_status_agrees_with_valid(roadmap):
+    low, high = roadmap.points.amin(0) - 0.5, roadmap.points.amax(0) + 0.5
+    points = low + (high - low) * torch.rand(
+        500, len(low), dtype=torch.float64, generator=torch.Generator().manual_seed(2)
+    )
+    solution = roadmap.solve(points)
+    assert set(np.unique(solution.status)) <= set(STATUSES)
+    assert np.array_equal(np.isin(solution.status, STATUSES[:2]), solution.valid.numpy())
+    outside = ((points < roadmap.points.amin(0)) | (points > roadmap.points.amax(0))).any(1).numpy()
+    assert np.array_equal(solution.status == "outside", outside)
+
+
+def test_at_a_vertex_it_is_the_vertexs_configuration(roadmap):
+    vertices = roadmap.resolved.nonzero()[:, 0]
+    solution = roadmap.solve(roadmap.points[vertices])
+    wraps = roadmap.robot.continuous
+    apart = grr_torch.spaces.configuration.distance(solution.configurations, roadmap.configurations[vertices], wraps)
+    # but for vertices cut off from most of those around them
+    assert float(solution.valid.double().mean()) > 0.95
+    assert float((apart[solution.valid] < 1e-6).double().mean()) > 0.95
+
+
+def test_nearly_all_points_inside_connected_cells_are_solved(roadmap):
+    assert float(roadmap.solve(_inside(roadmap, 2000)).valid.double().mean()) >= 0.99
+
+
+def test_small_moves_of_the_point_are_small_moves_of_the_arm(roadmap):
+    points = _inside(roadmap, 1000)
+    first, second = roadmap.solve(points), roadmap.solve(points + 1e-6)
+    both = first.valid & second.valid & torch.from_numpy((first.status == "solved") & (second.status == "solved"))
+    moved = grr_torch.spaces.configuration.distance(
+        first.configurations[both], second.configurations[both], roadmap.robot.continuous
+    )
+    # a projection stops anywhere within its tolerance
+    assert float(moved.median()) < 1e-3
+    assert float(moved.max()) < 0.05
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3, 1, 2)])
+def test_batch_shapes_give_the_same_as_one_at_a_time(planar_roadmap, shape):
+    points = _inside(planar_roadmap, max(1, int(np.prod(shape)))).reshape(*shape, 2)
+    solution = planar_roadmap.solve(points)
+    assert solution.configurations.shape == (*shape, 5)
+    assert solution.valid.shape == solution.status.shape == shape
+    for index in np.ndindex(shape):
+        alone = planar_roadmap.solve(points[index])
+        assert torch.allclose(alone.configurations, solution.configurations[index], atol=1e-9, equal_nan=True)
+        assert alone.status == solution.status[index]
+
+
+def test_no_points_give_no_configurations(planar_roadmap):
+    assert planar_roadmap.solve(torch.empty(0, 2, dtype=torch.float64)).configurations.shape == (0, 5)
+
+
+def test_vertices_cut_off_from_the_others_do_not_count(planar_roadmap):
+    """A neighbour with an unrelated configuration whose edges are all broken changes nothing."""
+    from dataclasses import replace
+
+    points = _inside(planar_roadmap, 300)
+    vertex = planar_roadmap.solver.nearest(points[:1])[1][0, 0]
+    configurations = planar_roadmap.configurations.clone()
+    configurations[vertex] += 2.0
+    away = planar_roadmap.connected & ~(planar_roadmap.edges == vertex).any(1)
+    spoilt = replace(planar_roadmap, configurations=configurations, connected=away)
+    removed = replace(planar_roadmap, connected=away)
+    for point in points[(points - planar_roadmap.points[vertex]).norm(dim=1) > 1e-3][:5]:
+        first, second = spoilt.solve(point), removed.solve(point)
+        assert torch.allclose(first.configurations, second.configurations, atol=1e-9, equal_nan=True)
+
+
+def test_points_in_uncertified_cells_say_so(kinova_roadmap):
+    triangles_, _ = kinova_roadmap.uncertified
+    assert len(triangles_)
+    centres = kinova_roadmap.points[triangles_].mean(1)
+    solution = kinova_roadmap.solve(centres)
+    assert set(np.unique(solution.status[solution.valid.numpy()])) == {"uncertified"}
+    certified = kinova_roadmap.cells()[0]
+    inner = certified.corners[certified.certified]
+    share = (kinova_roadmap.solve(kinova_roadmap.points[inner].mean(1)).status == "solved").mean()
+    # a certified triangle may bound a pyramid that another cell spoils
+    assert share > 0.9
+
+
+def test_random_graphs_solve_too(planar_5):
+    graph = grr_torch.random_graph([(-0.9, 0.9), (-0.9, 0.9)], 250, k=8, generator=torch.Generator().manual_seed(0))
+    roadmap = grr_torch.build(planar_5, "position", points=graph, refine=False)
+    assert float(roadmap.solve(_inside(roadmap, 300)).valid.double().mean()) > 0.95
+
+
+@pytest.mark.parametrize(
+    ("points", "what"),
+    [
+        (torch.tensor([float("nan"), 0.0]), "finite"),
+        (torch.zeros(4, 3), "shape"),
+        (torch.tensor(1.0), "shape"),
+        ([0.1, 0.2], "tensor"),
+    ],
+)
+def test_bad_points_are_refused(planar_roadmap, points, what):
+    with pytest.raises(ParameterError, match=what):
+        planar_roadmap.solve(points)
+
+
+def test_a_roadmap_without_a_resolved_vertex_is_refused(planar_roadmap):
+    from dataclasses import replace
+
+    empty = replace(
+        planar_roadmap,
+        resolved=torch.zeros_like(planar_roadmap.resolved),
+        connected=torch.zeros_like(planar_roadmap.connected),
+        configurations=torch.full_like(planar_roadmap.configurations, torch.nan),
+    )
+    with pytest.raises(ParameterError, match="resolved vertex"):
+        empty.solve(torch.zeros(2, dtype=torch.float64))

@@ -1,0 +1,239 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import grr_torch
+from grr_torch.applications.teleoperate import STATUSES, Teleoperator
+from grr_torch.errors import ParameterError
+
+
+@pytest.fixture(scope="module")
+def roadmap(kinova) -> grr_torch.Roadmap:
+    return grr_torch.build(kinova, "fixed-rotation")
+
+
+def _vertices(roadmap: grr_torch.Roadmap, count: int, seed: int = 0) -> torch.Tensor:
+    """Resolved vertices of one connected part."""
+    resolved = roadmap.resolved.nonzero()[:, 0]
+    order = torch.randperm(len(resolved), generator=torch.Generator().manual_seed(seed))
+    return resolved[order[:count]]
+
+
+def _hostile(roadmap: grr_torch.Roadmap, arms: int, steps: int, seed: int) -> torch.Tensor:
+    """Targets (steps, arms, width) that wander, leap, leave the reach and pass through the base."""
+    generator = torch.Generator().manual_seed(seed)
+    low, high = roadmap.points.amin(0) - 0.3, roadmap.points.amax(0) + 0.3
+    leaps = low + (high - low) * torch.rand(steps, arms, len(low), dtype=torch.float64, generator=generator)
+    held = leaps[torch.arange(steps) // 15 * 15]
+    walk = 0.02 * torch.randn(steps, arms, len(low), dtype=torch.float64, generator=generator)
+    return held + walk.cumsum(0)
+
+
+def _follow(teleoperator: Teleoperator, targets: torch.Tensor) -> tuple[torch.Tensor, np.ndarray]:
+    commands = [teleoperator.step(target) for target in targets]
+    return torch.stack([c.configuration for c in commands]), np.stack([c.status for c in commands])
+
+
+def _between(q: torch.Tensor, count: int = 8) -> torch.Tensor:
+    """Configurations (steps − 1, count, …) between successive ones."""
+    fractions = torch.arange(1, count + 1, dtype=q.dtype).reshape(-1, *[1] * (q.ndim - 1)) / count
+    return q[:-1, None] + fractions * (q[1:] - q[:-1])[:, None]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_step_is_too_long_or_through_a_collision_whatever_the_targets(roadmap, seed):
+    robot = roadmap.robot
+    start = roadmap.configurations[_vertices(roadmap, 8, seed)]
+    teleoperator = Teleoperator(roadmap, start=start)
+    q, status = _follow(teleoperator, _hostile(roadmap, 8, 90, seed))
+    q = torch.cat([start[None], q])
+    assert bool((q.diff(dim=0).abs() <= robot.velocity_limits / 50.0).all())
+    assert not bool(robot.in_self_collision(_between(q)).any())
+    assert bool(robot.within_limits(q).all())
+    assert set(np.unique(status)) <= set(STATUSES)
+
+
+def test_a_reachable_target_is_reached_and_held(roadmap):
+    vertices = _vertices(roadmap, 24, 3)
+    start, goals = roadmap.configurations[vertices[:12]], roadmap.points[vertices[12:]]
+    teleoperator = Teleoperator(roadmap, start=start, max_step=0.1)
+    q, status = _follow(teleoperator, goals.expand(150, -1, -1))
+    apart = (roadmap.robot.forward_kinematics(q[-1])[0] - goals).norm(dim=1)
+    assert float(apart.max()) < 1e-3
+    assert (status[-1] == "tracking").all()
+    assert float((q[-1] - q[-2]).abs().max()) < 1e-4
+
+
+def test_the_arm_ends_at_the_maps_configuration_whatever_way_it_came(roadmap):
+    vertices = _vertices(roadmap, 7, 5)
+    goal = roadmap.points[vertices[0]]
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertices[1:]], max_step=0.1)
+    q, _ = _follow(teleoperator, goal.expand(150, 6, -1))
+    apart = grr_torch.spaces.configuration.distance(q[-1], q[-1, :1], roadmap.robot.continuous)
+    assert float(apart.max()) < 1e-3
+
+
+def test_targets_out_of_reach_are_approached_and_slid_along(roadmap):
+    centre, radius = torch.tensor([0.0, 0.0, 0.3], dtype=torch.float64), 1.6
+    angles = torch.linspace(0.0, 1.0, 120, dtype=torch.float64)
+    targets = centre + radius * torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], dim=1)
+    vertex = roadmap.solver.nearest(targets[:1])[1][0, 0]
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex])
+    q, status = _follow(teleoperator, targets)
+    tool = roadmap.robot.forward_kinematics(q)[0]
+    assert set(status[20:]) <= {"unreachable", "detouring"}
+    azimuth = torch.atan2(tool[:, 1], tool[:, 0])
+    assert float((azimuth[40:] - angles[40:]).abs().max()) < 0.2
+    # no freeze: at 50 Hz it does not stand still for half a second
+    still = (q.diff(dim=0).abs().amax(1) < 1e-4).numpy()
+    longest = max((len(run) for run in "".join("x" if s else " " for s in still[40:]).split()), default=0)
+    assert longest < 25
+
+
+def test_an_arm_on_its_task_keeps_it_while_it_tracks(roadmap):
+    vertices = _vertices(roadmap, 10, 7)
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertices[:5]])
+    q, status = _follow(teleoperator, roadmap.points[vertices[5:]].expand(120, -1, -1))
+    position, rotation = roadmap.robot.forward_kinematics(q.reshape(-1, 7))
+    error = roadmap.task.error(position.T, position.T, rotation.permute(1, 2, 0))
+    turned = roadmap.task.residuals(error)[1].reshape(status.shape)
+    assert float(turned[torch.from_numpy(status == "tracking")].max()) < 0.01
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_any_measured_start_comes_back_to_the_map(roadmap, seed):
+    """Off the map, off the task, outside a limit; those in self-collision are another test's."""
+    robot = roadmap.robot
+    start = robot.sample(40, torch.Generator().manual_seed(seed))
+    start[:5, 1] = 2.6
+    start = start[~robot.in_self_collision(start)][:10]
+    goal = roadmap.points[_vertices(roadmap, 1, seed)[0]]
+    teleoperator = Teleoperator(roadmap, start=start, max_step=0.1)
+    q, _ = _follow(teleoperator, goal.expand(220, len(start), -1))
+    assert bool((torch.cat([start[None], q]).diff(dim=0).abs() <= 0.1).all())
+    assert not bool(robot.in_self_collision(_between(torch.cat([start[None], q]))).any())
+    apart = (robot.forward_kinematics(q[-1])[0] - goal).norm(dim=1)
+    assert float((apart < 1e-3).double().mean()) >= 0.8
+
+
+def test_from_a_contact_it_never_goes_deeper(roadmap):
+    robot = roadmap.robot
+    start = robot.sample(4000, torch.Generator().manual_seed(3))
+    start = start[robot.in_self_collision(start)][:8]
+    teleoperator = Teleoperator(roadmap, start=start)
+    q, _ = _follow(teleoperator, roadmap.points[_vertices(roadmap, 8, 3)].expand(120, -1, -1))
+    clearance = robot.self_collision_distance(torch.cat([start[None], q])) - robot.margin
+    deepest = clearance.clamp_max(0.0)
+    assert bool((deepest.diff(dim=0) >= -1e-6).all())
+    assert float((deepest[-1] >= 0.0).double().mean()) > 0.5
+
+
+def test_acceleration_limits_hold_and_arms_still_arrive(roadmap):
+    vertices = _vertices(roadmap, 12, 11)
+    start, goals = roadmap.configurations[vertices[:6]], roadmap.points[vertices[6:]]
+    teleoperator = Teleoperator(roadmap, start=start, acceleration_limits=3.0)
+    q, _ = _follow(teleoperator, goals.expand(400, -1, -1))
+    q = torch.cat([start[None], start[None], q])
+    speed = q.diff(dim=0) * 50.0
+    assert bool((speed.abs() <= roadmap.robot.velocity_limits * (1.0 + 1e-9)).all())
+    assert float(speed.diff(dim=0).abs().max()) * 50.0 <= 3.0 * (1.0 + 1e-6)
+    assert not bool(roadmap.robot.in_self_collision(_between(q)).any())
+    apart = (roadmap.robot.forward_kinematics(q[-1])[0] - goals).norm(dim=1)
+    assert float((apart < 1e-2).double().mean()) >= 0.8
+
+
+def test_many_arms_are_the_same_as_one_at_a_time(roadmap):
+    vertices = _vertices(roadmap, 6, 13)
+    targets = _hostile(roadmap, 6, 40, 4)
+    together = Teleoperator(roadmap, start=roadmap.configurations[vertices].reshape(3, 1, 2, 7))
+    q, status = _follow(together, targets.reshape(40, 3, 1, 2, 3))
+    assert q.shape == (40, 3, 1, 2, 7)
+    assert status.shape == (40, 3, 1, 2)
+    for arm in range(6):
+        alone = Teleoperator(roadmap, start=roadmap.configurations[vertices[arm]])
+        single, _ = _follow(alone, targets[:8, arm])
+        assert torch.allclose(single, q.reshape(40, 6, 7)[:8, arm], atol=1e-6)
+
+
+def test_joints_are_not_wrapped(planar_roadmap):
+    """Round the base, joint values go on beyond π."""
+    angles = torch.linspace(0.0, 4.0 * torch.pi, 400, dtype=torch.float64)
+    targets = 0.6 * torch.stack([angles.cos(), angles.sin()], dim=1)
+    q, _ = _follow(Teleoperator(planar_roadmap, max_step=0.2), targets)
+    assert float(q.diff(dim=0).abs().max()) <= 0.2
+    assert float((q[-1, 0] - q[0, 0]).abs()) > 6.0
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_target_that_is_not_finite_is_refused_and_held(roadmap, bad):
+    vertices = _vertices(roadmap, 2, 1)
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertices])
+    target = roadmap.points[vertices].clone()
+    target[0, 1] = bad
+    before = teleoperator.configuration
+    command = teleoperator.step(target)
+    assert command.status.tolist() == ["holding", "tracking"]
+    assert torch.equal(command.configuration[0], before[0])
+    assert bool(command.configuration.isfinite().all())
+
+
+def test_a_far_jump_is_refused_until_reset(roadmap):
+    first, second = _vertices(roadmap, 2, 2)
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[first], max_jump=0.05)
+    assert teleoperator.step(roadmap.points[first]).status == "tracking"
+    held = teleoperator.step(roadmap.points[second])
+    assert held.status == "holding"
+    assert torch.equal(teleoperator.step(roadmap.points[second]).configuration, held.configuration)
+    teleoperator.reset()
+    assert teleoperator.step(roadmap.points[second]).status != "holding"
+
+
+def test_old_input_is_refused(roadmap):
+    vertex = _vertices(roadmap, 1, 4)[0]
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex], timeout=0.1)
+    point = roadmap.points[vertex]
+    for step in range(10):
+        assert teleoperator.step(point, time=1000.0 + 0.02 * step).status == "tracking"
+    stale = [str(teleoperator.step(point, time=1000.18).status) for _ in range(10)]
+    assert stale[0] == "tracking"
+    assert stale[-1] == "holding"
+    assert teleoperator.step(point, time=float("nan")).status == "holding"
+    teleoperator.reset()
+    assert teleoperator.step(point, time=5.0).status == "tracking"
+
+
+def test_after_the_clutch_it_starts_where_the_arm_is(roadmap):
+    first, second = _vertices(roadmap, 2, 6)
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[first])
+    teleoperator.step(roadmap.points[first])
+    teleoperator.reset(roadmap.configurations[second])
+    command = teleoperator.step(roadmap.points[second])
+    assert torch.allclose(command.configuration, roadmap.configurations[second], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        ({"rate": 0.0}, "rate"),
+        ({"rate": float("nan")}, "rate"),
+        ({"max_step": -0.1}, "max_step"),
+        ({"max_step": torch.ones(3)}, "max_step"),
+        ({"acceleration_limits": 0.0}, "acceleration_limits"),
+        ({"max_jump": 0.0}, "max_jump"),
+        ({"timeout": -1.0}, "timeout"),
+        ({"start": torch.zeros(6)}, "shape"),
+        ({"start": torch.full((7,), float("nan"))}, "finite"),
+    ],
+)
+def test_bad_parameters_are_refused(roadmap, arguments, what):
+    with pytest.raises(ParameterError, match=what):
+        Teleoperator(roadmap, **arguments)
+
+
+@pytest.mark.parametrize("target", [torch.zeros(2), torch.zeros(5, 3), [0.1, 0.2, 0.3], torch.tensor(0.5)])
+def test_targets_of_another_shape_are_refused(roadmap, target):
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[_vertices(roadmap, 1)[0]])
+    with pytest.raises(ParameterError, match="target"):
+        teleoperator.step(target)
