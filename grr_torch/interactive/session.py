@@ -14,8 +14,8 @@ from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
 from grr_torch.errors import ParameterError
 from grr_torch.resolution.roadmap import Roadmap
 
-# a target may leave the roadmap by this share of its size
-_BEYOND = 0.15
+# a target may leave what is resolved by this share of its size
+_BEYOND = 0.25
 
 
 class Session:
@@ -61,7 +61,8 @@ class Session:
             max_step=max_step,
             acceleration_limits=acceleration_limits,
         )
-        low, high = roadmap.points.amin(0), roadmap.points.amax(0)
+        resolved = roadmap.points[roadmap.resolved]
+        low, high = resolved.amin(0), resolved.amax(0)
         self.low, self.high = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
         self.log = TeleoperationLog(roadmap, rate)
         self._target = self.tool = tuple(self.home.tolist())
