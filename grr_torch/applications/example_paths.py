@@ -14,8 +14,8 @@ from grr_torch.spaces.configuration import difference
 
 KINDS = ("circle", "line")
 
-# metres a second along a path
-_SPEED = 0.15
+# metres a second along a path, and the most waypoints a second
+_SPEED, _FASTEST = 0.15, 1e4
 # points at which a candidate is tried, sizes that are tried, and middles
 _POINTS, _SIZES, _MIDDLES = 96, 16, 5
 # of the largest size that fits, so that the path is not on the edge of reach
@@ -60,10 +60,12 @@ def example_path(roadmap: Roadmap, kind: str, rate: float = 50.0) -> Tensor:
 
     Raises:
         UnknownNameError: No such kind.
-        ParameterError: No such path fits into the roadmap.
+        ParameterError: No such path fits into the roadmap, or the rate is out of its range.
     """
     if kind not in KINDS:
         raise UnknownNameError("path", kind, KINDS)
+    if not 0.0 < rate <= _FASTEST:
+        raise ParameterError("rate", rate, f"above 0 and up to {_FASTEST:,.0f} Hz")
     centres = middles(roadmap, _MIDDLES)
     axis = centres[:1].clone()
     axis[:, :2] = 0.0

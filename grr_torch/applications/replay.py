@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 
-import torch
 from torch import Tensor
 
 from grr_torch.applications.teleoperate import Teleoperator

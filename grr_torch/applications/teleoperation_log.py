@@ -54,7 +54,8 @@ class Summary:
         seconds: How long it took in the arm's time [s].
         shares: The share of steps with each status.
         joint_step: The most that a joint moved in a step [rad or m].
-        stall: The longest time for which no joint moved though the tool was more than 1 cm from its target [s].
+        stall: The longest time for which no joint moved though the tool was more than 1 cm from its target [s];
+            also while the clutch was let go.
         clearance: The smallest self-collision distance, the margin subtracted [m]; None without a sphere model.
         deviation: Mean distance of the tool from its target in the same step [m].
         largest_deviation: The largest such distance [m].
@@ -79,7 +80,7 @@ class Summary:
 
 
 class TeleoperationLog:
-    """The steps of one teleoperation of one arm. Grows by `append`; an hour at 50 Hz is 30 MB."""
+    """The steps of one teleoperation of one arm. Grows by `append`; an hour at 50 Hz takes about 20 MB."""
 
     def __init__(self, roadmap: Roadmap, rate: float) -> None:
         self.roadmap, self.rate = roadmap, rate
@@ -125,7 +126,7 @@ class TeleoperationLog:
     @property
     def status(self) -> np.ndarray[Any, np.dtype[np.str_]]:
         """(T,) array of text: what `Command.status` says."""
-        return STATUSES[np.array(self._codes, dtype=np.intp)]
+        return STATUSES[np.array(self._codes[:], dtype=np.intp)]
 
     @cached_property
     def tools(self) -> Tensor:
@@ -194,7 +195,8 @@ class TeleoperationLog:
                 )
 
     def _table(self) -> Tensor:
-        return torch.tensor(self._rows, dtype=torch.float64).reshape(-1, self._width)
+        # an array cannot grow while something looks into it
+        return torch.from_numpy(np.array(self._rows[:])).reshape(-1, self._width)
 
 
 def check_trajectory_path(path: str | os.PathLike[str]) -> None:

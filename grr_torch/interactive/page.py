@@ -7,7 +7,8 @@ import io
 import socket
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +18,6 @@ from grr_torch.interactive.scene import ArmView, MapView, TrailView
 from grr_torch.interactive.session import Session
 from grr_torch.recording import colours
 from grr_torch.recording.self_motion_view import in_space
-
-if TYPE_CHECKING:
-    from viser import ViserServer
 
 # the arm and the words on the page are renewed so often [s]
 _ARM_PERIOD, _WORDS_PERIOD = 1.0 / 30.0, 0.1
@@ -96,11 +94,11 @@ class Page:
             position=self._place(self._session.target),
         )
 
-        @handle.on_update
-        async def _(event: Any) -> None:
+        async def dragged(event: Any) -> None:
             self._session.move(event.target.position[: len(self._session.low)])
             self._show_target()
 
+        handle.on_update(dragged)
         return handle
 
     def _add_panel(self) -> tuple[Any, list[Any]]:
@@ -116,23 +114,23 @@ class Page:
                 sliders.append(slider)
             self._button("Home", "home", session.go_home, "Back to where the target was at the start")
             self._button("Stop: target to the tool", "hand-stop", session.reset, "The arm stops where it is")
-            self._clutch = gui.add_checkbox("Clutch", True, hint="The arm follows; let go, it holds, and the target may be moved to anywhere")
+            self._clutch = gui.add_checkbox(
+                "Clutch", True, hint="The arm follows; let go, it holds, and the target may be moved to anywhere"
+            )
             self._clutch.on_update(self._clutched)
         with gui.add_folder("Show"):
             for name, part in self._map.parts.items():
                 gui.add_checkbox(name.capitalize(), bool(part.visible)).on_update(_shows(part))
         with gui.add_folder("Keys"):
-            keys = [f"{_AXES[axis]}: **{less}** − **{more}** +" for axis, (more, less) in enumerate(_KEYS[: len(session.low)])]
-            gui.add_markdown(f"{' · '.join(keys)}\n\n**R** stop · **H** home · **space** clutch")
+            keys = [
+                f"{_AXES[axis]}: **{less}** − **{more}** +"
+                for axis, (more, less) in enumerate(_KEYS[: len(session.low)])
+            ]
+            gui.add_markdown(f"{' · '.join(keys)}\n\n**R** stop · **H** home · **C** clutch")
         return words, sliders
 
     def _button(self, label: str, icon: str, action: Callable[[], None], hint: str) -> None:
-        button = self._server.gui.add_button(label, icon=icon, hint=hint)  # type: ignore[arg-type]
-
-        @button.on_click
-        async def _(_: Any) -> None:
-            action()
-            self._show_target()
+        self._server.gui.add_button(label, icon=icon, hint=hint).on_click(self._does(action))
 
     def _slid(self, axis: int) -> Any:
         async def slid(event: Any) -> None:
@@ -161,22 +159,21 @@ class Page:
         for axis, keys in enumerate(_KEYS[: len(self._session.low)]):
             for key, sign in zip(keys, (1.0, -1.0), strict=True):
                 label = f"Target {'+' if sign > 0 else '−'}{_AXES[axis]} by {1e3 * step:.0f} mm"
-                moves.append((label, key, lambda axis=axis, by=sign * step: self._session.nudge(axis, by)))  # type: ignore[misc]
+                moves.append((label, key, partial(self._session.nudge, axis, sign * step)))
         moves += [
             ("Stop: target to the tool", "R", self._session.reset),
             ("Target home", "H", self._session.go_home),
-            ("Clutch", "space", lambda: self._set_clutch(not self._session.engaged)),
+            ("Clutch", "C", lambda: self._set_clutch(not self._session.engaged)),
         ]
         for label, key, action in moves:
-            self._add_key(label, key, action)
+            self._server.gui.add_command(label, hotkey=key).on_trigger(self._does(action))
 
-    def _add_key(self, label: str, key: str, action: Callable[[], None]) -> None:
-        command = self._server.gui.add_command(label, hotkey=key)  # type: ignore[arg-type]
-
-        @command.on_trigger
-        async def _(_: Any) -> None:
+    def _does(self, action: Callable[[], None]) -> Any:
+        async def does(_: Any) -> None:
             action()
             self._show_target()
+
+        return does
 
     def _show_target(self) -> None:
         """Puts handle and sliders where the target is. Called in the server's own loop only, so in order."""
@@ -194,15 +191,19 @@ class Page:
         if step is not None:
             away = np.linalg.norm(np.subtract(self._session.tool, step.target[: len(self._session.tool)]))
             clearance = f"{1e3 * step.clearance:.0f}" if np.isfinite(step.clearance) else "–"
-            figures = [("clearance", clearance, "mm"), ("to target", f"{1e3 * away:.0f}", "mm"), ("step", f"{1e3 * median:.1f}", "ms")]
+            figures = [
+                ("clearance", clearance, "mm"),
+                ("to target", f"{1e3 * away:.0f}", "mm"),
+                ("step", f"{1e3 * median:.1f}", "ms"),
+            ]
         cells = "".join(
-            f'<div style="flex:1"><div style="opacity:.6;font-size:.8em">{name}</div>'
-            f'<span id="grr-{name.replace(" ", "-")}" style="font-size:1.35em;font-weight:600">{value}</span> {unit}</div>'
+            f'<div style="flex:1"><div style="opacity:.6;font-size:.8em">{name}</div><span id="grr-{name.split()[-1]}"'
+            f' style="font-size:1.35em;font-weight:600">{value}</span> {unit}</div>'
             for name, value, unit in figures
         )
+        badge = "color:#fff;font-weight:700;text-align:center;border-radius:6px;padding:.25em;letter-spacing:.06em"
         return (
-            f'<div style="padding:.5em .75em 0"><div id="grr-status" style="background:{hue};color:#fff;font-weight:700;'
-            f'text-align:center;border-radius:6px;padding:.25em;letter-spacing:.06em">{status}</div>'
+            f'<div style="padding:.5em .75em 0"><div id="grr-status" style="background:{hue};{badge}">{status}</div>'
             f'<div style="display:flex;padding:.5em .1em 0;font-variant-numeric:tabular-nums">{cells}</div></div>'
         )
 
@@ -242,7 +243,7 @@ class Page:
         return place
 
 
-def _serve(host: str, port: int, name: str) -> ViserServer:
+def _serve(host: str, port: int, name: str) -> Any:
     try:
         import viser
     except ImportError as error:
@@ -254,7 +255,9 @@ def _serve(host: str, port: int, name: str) -> ViserServer:
             probe.bind((host, port))
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise ParameterError("host and port", f"{host}:{port}", f"an address that can be bound, 0 for any ({reason})") from error
+        raise ParameterError(
+            "host and port", f"{host}:{port}", f"an address that can be bound, 0 for any ({reason})"
+        ) from error
     # it prints a table of its addresses
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label=f"grr-torch · {name}", verbose=False)

@@ -19,7 +19,6 @@ from grr_torch.spaces.rotation import quaternion_from_matrix
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
-    from viser import ViserServer
 
 # positions of the tool that its trail shows
 _TRAIL = 160
@@ -31,7 +30,8 @@ def link_meshes(robot: Robot) -> dict[str, list[Trimesh]]:
     from trimesh import Trimesh
 
     urdf = yourdfpy.URDF.load(io.BytesIO(displayable(robot, "page")))
-    scene, parts = urdf.scene, {}
+    scene = urdf.scene
+    parts: dict[str, list[Trimesh]] = {}
     for node in scene.graph.nodes_geometry:
         link = scene.graph.transforms.parents[node]
         solid = scene.geometry[scene.graph[node][1]]
@@ -45,17 +45,20 @@ def link_meshes(robot: Robot) -> dict[str, list[Trimesh]]:
 class ArmView:
     """An arm on the page, a frame for each link."""
 
-    def __init__(self, server: ViserServer, robot: Robot) -> None:
+    def __init__(self, server: Any, robot: Robot) -> None:
         self._robot = robot
         self._frames: dict[str, Any] = {}
-        for link, meshes in link_meshes(robot).items():
-            self._frames[link] = server.scene.add_frame(f"/arm/{link}", show_axes=False)
+        # a link's name may hold a slash, which would make it part of another
+        for index, (link, meshes) in enumerate(link_meshes(robot).items()):
+            self._frames[link] = server.scene.add_frame(f"/arm/{index}", show_axes=False)
             for number, mesh in enumerate(_joined(meshes)):
-                server.scene.add_mesh_trimesh(f"/arm/{link}/{number}", mesh)
+                server.scene.add_mesh_trimesh(f"/arm/{index}/{number}", mesh)
 
     def show(self, configuration: Tensor) -> None:
         """Puts the arm at a configuration (n,)."""
         poses = self._robot.link_poses(configuration)
+        if not self._frames:
+            return
         placed = torch.stack([poses[link] for link in self._frames])
         turned = quaternion_from_matrix(placed[:, :3, :3]).cpu().numpy()
         for frame, position, wxyz in zip(self._frames.values(), placed[:, :3, 3].cpu().numpy(), turned, strict=True):
@@ -66,9 +69,9 @@ def _joined(meshes: list[Trimesh]) -> list[Trimesh]:
     """One mesh of those that are coloured face by face; textured ones stay alone."""
     import trimesh
 
-    plain = [mesh for mesh in meshes if mesh.visual.kind != "texture"]
-    joined = trimesh.util.concatenate(plain) if plain else None
-    return [*([joined] if joined is not None else []), *(mesh for mesh in meshes if mesh.visual.kind == "texture")]
+    textured: list[Any] = [mesh for mesh in meshes if isinstance(mesh.visual, trimesh.visual.TextureVisuals)]
+    plain = [mesh for mesh in meshes if not isinstance(mesh.visual, trimesh.visual.TextureVisuals)]
+    return [*textured, trimesh.util.concatenate(plain)] if plain else textured
 
 
 class MapView:
@@ -78,22 +81,29 @@ class MapView:
         parts: What is shown, by name.
     """
 
-    def __init__(self, server: ViserServer, roadmap: Roadmap) -> None:
+    def __init__(self, server: Any, roadmap: Roadmap) -> None:
         points, resolved = in_space(roadmap.points.numpy()), roadmap.resolved.numpy()
-        spacing = self._spacing(roadmap)
         first = roadmap.configurations[roadmap.resolved][:, 0].numpy()
         shade = colours.circle(first) if bool(roadmap.robot.continuous[0]) else colours.scale(first)
-        self.parts: dict[str, Any] = {
-            "roadmap": server.scene.add_point_cloud(
-                "/roadmap/points", points[resolved].astype(np.float32), shade, point_size=0.055 * spacing,
-                point_shape="circle", precision="float32",
-            )
-        }  # fmt: skip
+        dots = server.scene.add_point_cloud(
+            "/roadmap/points",
+            points[resolved].astype(np.float32),
+            shade,
+            point_size=(0.055 if roadmap.task.dimension == 3 else 0.12) * self._spacing(roadmap),
+            point_shape="circle",
+            precision="float32",
+        )
+        self.parts: dict[str, Any] = {"roadmap": dots}
         edges = roadmap.edges[~roadmap.connected].numpy()
         edges = edges[resolved[edges].all(1)]
         if len(edges):
             self.parts["broken edges"] = server.scene.add_line_segments(
-                "/roadmap/broken", points[edges], colours.BROKEN[:3], thickness=3.0, thickness_units="screen", visible=False
+                "/roadmap/broken",
+                points[edges],
+                colours.BROKEN[:3],
+                thickness=3.0,
+                thickness_units="screen",
+                visible=False,
             )
         triangles, faces = (corners.numpy() for corners in roadmap.uncertified)
         cells = np.concatenate([triangles, faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
@@ -112,7 +122,7 @@ class MapView:
 class TrailView:
     """The tool's last seconds on the page, in colours of the status, and a dot where it is."""
 
-    def __init__(self, server: ViserServer, start: np.ndarray) -> None:
+    def __init__(self, server: Any, start: np.ndarray) -> None:
         self._places: deque[np.ndarray] = deque(maxlen=_TRAIL)
         self._hues: deque[tuple[int, int, int]] = deque(maxlen=_TRAIL)
         nothing = np.repeat(start[None, None], 2, axis=1)

@@ -1,4 +1,4 @@
-"""Recording a teleoperation with rerun: target, tool and arm in space; status, joints and clearance below each other."""
+"""Recording a teleoperation with rerun: target, tool and arm in space; status, joints and clearance over time."""
 
 from __future__ import annotations
 
@@ -125,7 +125,9 @@ class _Scene:
             recording.send_columns(f"space/{name}", indexes=[times], columns=columns)
         between = np.stack([self.tools, self.targets], axis=1)
         recording.log("space/between", frame, static=True)
-        columns = rr.LineStrips3D.columns(strips=between, colors=[(255, 255, 255, 120)] * count, radii=[line(0.8)] * count)
+        columns = rr.LineStrips3D.columns(
+            strips=between, colors=[(255, 255, 255, 120)] * count, radii=[line(0.8)] * count
+        )
         recording.send_columns("space/between", indexes=[times], columns=columns)
 
     def _log_status(self, recording: Any) -> None:
