@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -316,6 +317,16 @@ def test_a_mistake_is_one_clear_line_and_nothing_is_written(file, tmp_path, monk
     assert complaint in result.stderr
     assert "Traceback" not in result.output
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_port_in_use_is_a_clear_error(file):
+    pytest.importorskip("viser", reason="viser is not installed")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        result = invoke("teleop", file, "--port", taken.getsockname()[1])
+    assert result.exit_code == 2
+    assert "in use" in result.stderr
 
 
 def test_without_viser_the_message_names_the_extra(planar_roadmap, file, monkeypatch):
