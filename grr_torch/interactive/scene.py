@@ -71,7 +71,8 @@ def _joined(meshes: list[Trimesh]) -> list[Trimesh]:
 
     textured: list[Any] = [mesh for mesh in meshes if isinstance(mesh.visual, trimesh.visual.TextureVisuals)]
     plain = [mesh for mesh in meshes if not isinstance(mesh.visual, trimesh.visual.TextureVisuals)]
-    return [*textured, trimesh.util.concatenate(plain)] if plain else textured
+    joined: list[Any] = [trimesh.util.concatenate(plain)] if plain else []
+    return joined + textured
 
 
 class MapView:
