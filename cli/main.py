@@ -15,6 +15,7 @@ from grr_torch.cli.robots import robots
 from grr_torch.cli.smm import smm
 from grr_torch.cli.solve import solve
 from grr_torch.cli.spheres import spheres
+from grr_torch.cli.teleop import teleop
 from grr_torch.cli.view import view
 
 from grr_torch.version import __version__
@@ -28,7 +29,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for command in (robots, build, info, view, solve, plan, spheres, smm):
+for command in (robots, build, info, view, solve, plan, teleop, smm, spheres):
     app.command()(command)
 app.add_typer(bench)
 

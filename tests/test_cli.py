@@ -242,7 +242,9 @@ def test_ctrl_c_leaves_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("command", [[], ["build"], ["info"], ["view"], ["solve"], ["plan"], ["robots"], ["spheres"]])
+@pytest.mark.parametrize(
+    "command", [[], ["build"], ["info"], ["view"], ["solve"], ["plan"], ["teleop"], ["smm"], ["robots"], ["spheres"]]
+)
 def test_help_has_an_example(tmp_path, command):
     result = run(*command, "--help", cwd=tmp_path)
     assert result.returncode == 0
@@ -251,9 +253,8 @@ def test_help_has_an_example(tmp_path, command):
 
 
 def test_help_imports_nothing_heavy(tmp_path):
-    code = (
-        "import sys, grr_torch.cli.main; print([m for m in ('torch', 'numpy', 'rerun', 'trimesh') if m in sys.modules])"
-    )
+    heavy = ("torch", "numpy", "rerun", "trimesh", "viser")
+    code = f"import sys, grr_torch.cli.main; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 

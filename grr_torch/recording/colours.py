@@ -15,6 +15,13 @@ SPREAD = (240, 150, 40, 110)
 UNRESOLVED = (255, 176, 0, 255)
 GRID = (40, 43, 50, 255)
 TOUR = (235, 235, 235, 255)
+# of a teleoperation
+STATUS = {
+    "tracking": (70, 200, 120),
+    "detouring": (70, 150, 255),
+    "holding": (245, 175, 50),
+    "unreachable": (240, 85, 75),
+}
 
 # dark blue over green to yellow, of about even steps in lightness
 _SCALE = np.array([[59, 28, 92], [52, 94, 141], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=np.float64)

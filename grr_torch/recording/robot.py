@@ -27,7 +27,7 @@ class RecordedRobot:
         self._recording, self._robot = recording, robot
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "robot.urdf"
-            path.write_bytes(_displayable(robot))
+            path.write_bytes(displayable(robot, "recording"))
             self._tree = UrdfTree.from_file_path(path, entity_path_prefix="robot")
             self._tree.log_urdf_to_recording(recording)
 
@@ -51,8 +51,8 @@ class RecordedRobot:
         return multiplier * self._values(robot.urdf.joints[source], q) + offset
 
 
-def _displayable(robot: Robot) -> bytes:
-    """The URDF with visual shapes only and absolute mesh paths."""
+def displayable(robot: Robot, where: str) -> bytes:
+    """The URDF with visual shapes only and absolute mesh paths; warns of meshes that `where` it is shown will lack."""
     from lxml import etree
 
     root = etree.fromstring(robot.urdf.text.encode(), etree.XMLParser(resolve_entities=False, no_network=True))
@@ -74,6 +74,6 @@ def _displayable(robot: Robot) -> bytes:
         for shape in link.findall("collision"):
             shape.tag = "visual"
     if missing:
-        text = f"{len(missing)} meshes are left out of the recording, not found: {', '.join(sorted(set(missing)))}"
+        text = f"{len(missing)} meshes are left out of the {where}, not found: {', '.join(sorted(set(missing)))}"
         warnings.warn(text, GrrWarning, stacklevel=3)
     return bytes(etree.tostring(root))

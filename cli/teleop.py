@@ -1,0 +1,142 @@
+"""`grr-torch teleop`."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from grr_torch.cli.show import print_json, print_rows, progress_bar, reports_errors
+
+from grr_torch.errors import ParameterError
+
+if TYPE_CHECKING:
+    from grr_torch.applications.teleoperation_log import Summary, TeleoperationLog
+    from grr_torch.resolution.roadmap import Roadmap
+
+
+@reports_errors
+def teleop(
+    file: Annotated[Path, typer.Argument(help="A roadmap file.", metavar="FILE.grr")],
+    path: Annotated[
+        str | None,
+        typer.Option(
+            help="Replay circle, line or a FILE of waypoints (.csv, .npy or .parquet: one a row and control step, in "
+            "metres) without a browser.",
+            metavar="circle|line|FILE",
+        ),
+    ] = None,
+    record: Annotated[Path | None, typer.Option(help="Recording to write at the end.", metavar="FILE.rrd")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write the joint trajectory, unwrapped.", metavar="FILE.csv|.npy|.npz")
+    ] = None,
+    rate: Annotated[float, typer.Option(help="Control steps in a second.")] = 50.0,
+    max_step: Annotated[
+        float | None,
+        typer.Option(
+            help="The most that a joint moves in a step, in radians; by default its velocity limit over the rate."
+        ),
+    ] = None,
+    acceleration: Annotated[
+        float | None, typer.Option(help="Acceleration limit of all joints, in rad/s²; by default none.")
+    ] = None,
+    host: Annotated[
+        str, typer.Option(help="Address of the page; by default no other machine can open it.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0: any that is free.")] = 8080,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
+) -> None:
+    """Teleoperate an arm on its roadmap, in the browser until Ctrl-C, or along a path.
+
+    Example: grr-torch teleop kinova.grr --record teleop.rrd
+
+    Example: grr-torch teleop kinova.grr --path circle --out circle.csv
+    """
+    from grr_torch.applications.teleoperation_log import check_trajectory_path
+    from grr_torch.output import check_writable
+    from grr_torch.resolution.roadmap import Roadmap
+
+    if out is not None:
+        check_trajectory_path(out)
+    inputs = [file.resolve(), *([Path(path).resolve()] if path else [])]
+    for written in (record, out):
+        if written is not None:
+            if written.resolve() in inputs:
+                raise ParameterError("--record and --out", written, "other files than those that are read")
+            check_writable(written)
+    if record is not None and out is not None and record.resolve() == out.resolve():
+        raise ParameterError("--out", out, "another file than the recording's")
+    roadmap = Roadmap.load(file)
+    limits = {"max_step": max_step, "acceleration_limits": acceleration}
+    log = _replay(roadmap, path, rate, limits) if path else _interact(roadmap, rate, limits, host, port)
+    _write(log, record, out)
+    summary = log.summary()
+    if as_json:
+        print_json(summary.to_dict())
+        return
+    print_rows(f"{roadmap.robot.name}, {roadmap.task.kind}: {summary.steps:,} control steps", _rows(summary))
+    files = ", ".join(str(name) for name in (record, out) if name is not None)
+    if files:
+        typer.echo(f"written: {files}")
+
+
+def _replay(roadmap: Roadmap, path: str, rate: float, limits: dict[str, Any]) -> TeleoperationLog:
+    from grr_torch.applications.example_paths import KINDS, example_path
+    from grr_torch.applications.replay import read_waypoints, replay
+    from grr_torch.errors import UnknownNameError
+
+    if path not in KINDS and not Path(path).suffix and not Path(path).exists():
+        raise UnknownNameError("path", path, KINDS, " Or the name of a file of waypoints.")
+    waypoints = example_path(roadmap, path, rate) if path in KINDS else read_waypoints(path, roadmap.task.width)
+    with progress_bar() as progress:
+        return replay(roadmap, waypoints, rate, **limits, progress=progress)
+
+
+def _interact(roadmap: Roadmap, rate: float, limits: dict[str, Any], host: str, port: int) -> TeleoperationLog:
+    """Until Ctrl-C, or until the process is asked to end."""
+    import signal
+    from threading import Event
+
+    from grr_torch.interactive.drive import drive
+    from grr_torch.interactive.page import Page
+    from grr_torch.interactive.session import Session
+
+    session = Session(roadmap, rate, **limits)
+    page = Page(session, host, port)
+    stop = Event()
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        typer.echo(f"{roadmap.robot.name} at {page.url}; Ctrl-C ends it", err=True)
+        drive(session, page.show, stop)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        page.close()
+    return session.log
+
+
+def _write(log: TeleoperationLog, record: Path | None, out: Path | None) -> None:
+    """Both files appear together, or neither does."""
+    from grr_torch.output import atomic_write
+    from grr_torch.recording.teleoperation import record_teleoperation
+
+    with ExitStack() as stack:
+        if record is not None:
+            record_teleoperation(log, stack.enter_context(atomic_write(record)))
+        if out is not None:
+            log.save_trajectory(stack.enter_context(atomic_write(out)))
+
+
+def _rows(summary: Summary) -> list[tuple[str, str]]:
+    shares = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in summary.shares.items() if share)
+    clearance = "not checked: no sphere model" if summary.clearance is None else f"{1e3 * summary.clearance:.1f} mm"
+    deviations = (summary.deviation, summary.largest_deviation, summary.final_deviation)
+    return [
+        ("status", shares),
+        ("time", f"{summary.seconds:.2f} s; a step takes {summary.step_milliseconds:.2f} ms (median)"),
+        ("largest joint step", f"{summary.joint_step:.4f} rad or m"),
+        ("longest stall", f"{summary.stall:.2f} s"),
+        ("smallest clearance", clearance),
+        ("from tool to target: mean, largest, last", ", ".join(f"{1e3 * value:.2f}" for value in deviations) + " mm"),
+    ]

@@ -1,0 +1,116 @@
+"""Paths that suit a roadmap: a middle to start from, and a circle and a line round it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from grr_torch.errors import ParameterError, UnknownNameError
+from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.spaces.configuration import difference
+
+KINDS = ("circle", "line")
+
+# metres a second along a path, and the most waypoints a second
+_SPEED, _FASTEST = 0.15, 1e4
+# points at which a candidate is tried, sizes that are tried, and middles
+_POINTS, _SIZES, _MIDDLES = 96, 16, 5
+# of the largest size that fits, so that the path is not on the edge of reach
+_SHARE = 0.8
+# two configurations farther apart than this are not neighbours on a path [rad]
+_APART = 0.4
+
+
+def middles(roadmap: Roadmap, count: int = 1) -> Tensor:
+    """The resolved vertices (count, width) that are deepest inside the roadmap, the deepest first [m].
+
+    Deep is what is far from unresolved vertices, from uncertified cells and from the roadmap's bounds. Of equally
+    deep ones, the first is nearest to the mean of all.
+
+    Raises:
+        ParameterError: No vertex is resolved.
+    """
+    points = roadmap.points
+    doubtful = ~roadmap.resolved
+    for corners in roadmap.uncertified:
+        doubtful[corners] = True
+    good = points[~doubtful] if not bool(doubtful.all()) else points[roadmap.resolved]
+    if len(good) == 0:
+        raise ParameterError("roadmap", "one without a resolved vertex", "one to move on")
+    depth = torch.minimum(good - points.amin(0), points.amax(0) - good).amin(1)
+    if bool(doubtful.any()):
+        depth = depth.minimum(torch.from_numpy(cKDTree(points[doubtful].numpy()).query(good.numpy())[0]))
+    away = (good - good.mean(0)).norm(dim=1)
+    return good[(1e-3 * away - depth).argsort()[:count]]
+
+
+def example_path(roadmap: Roadmap, kind: str, rate: float = 50.0) -> Tensor:
+    """A large circle or line (N, width) on which the roadmap is continuous, one waypoint for each control step [m].
+
+    A circle is horizontal and ends where it began, and so does a line: it goes there and back. The tool moves at
+    0.15 m/s. Circles round the base's axis are tried too.
+
+    Args:
+        roadmap: The roadmap.
+        kind: Of `KINDS`.
+        rate: Control steps in a second [Hz].
+
+    Raises:
+        UnknownNameError: No such kind.
+        ParameterError: No such path fits into the roadmap, or the rate is out of its range.
+    """
+    if kind not in KINDS:
+        raise UnknownNameError("path", kind, KINDS)
+    if not 0.0 < rate <= _FASTEST:
+        raise ParameterError("rate", rate, f"above 0 and up to {_FASTEST:,.0f} Hz")
+    centres = middles(roadmap, _MIDDLES)
+    axis = centres[:1].clone()
+    axis[:, :2] = 0.0
+    centres = torch.cat([centres, axis])
+    half = 0.5 * float((roadmap.points[roadmap.resolved].amax(0) - roadmap.points[roadmap.resolved].amin(0)).max())
+    sizes = half * torch.arange(_SIZES, 0, -1, dtype=torch.float64) / _SIZES
+    largest = None
+    for size in sizes.tolist():
+        if largest is not None and size > _SHARE * largest:
+            continue
+        tried = _circles(centres, size, _POINTS) if kind == "circle" else _lines(centres, size, _POINTS)
+        fits = _passable(roadmap, tried).nonzero()[:, 0]
+        if largest is None and len(fits) and size > sizes[-1]:
+            largest = size
+        elif len(fits):
+            length = 2.0 * math.pi * size if kind == "circle" else 4.0 * size
+            count = max(8, round(length / _SPEED * rate)) + 1
+            drawn = _circles(centres, size, count) if kind == "circle" else _lines(centres, size, count)
+            return drawn[fits[0]]
+    raise ParameterError("path", kind, "one that fits into the roadmap; this roadmap is too small for it")
+
+
+def _circles(centres: Tensor, radius: float, count: int) -> Tensor:
+    """Horizontal circles (C, count, width) round centres (C, width)."""
+    angles = torch.linspace(0.0, 2.0 * math.pi, count, dtype=torch.float64)
+    offsets = centres.new_zeros(count, centres.shape[1])
+    offsets[:, 0], offsets[:, 1] = radius * angles.cos(), radius * angles.sin()
+    return centres[:, None] + offsets
+
+
+def _lines(centres: Tensor, half: float, count: int) -> Tensor:
+    """Lines (C · K, count, width) through centres (C, width) in K directions, from one end to the other and back."""
+    d = centres.shape[1]
+    grid = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)] * d)
+    # of each pair of opposite ones, the one that comes later in the order
+    directions = torch.nn.functional.normalize(grid[len(grid) // 2 + 1 :], dim=1)
+    there = torch.linspace(-1.0, 1.0, (count + 1) // 2, dtype=torch.float64)
+    fractions = torch.cat([there, there.flip(0)[count % 2 :]])
+    offsets = half * fractions[:, None] * directions[:, None]
+    return (centres[:, None, None] + offsets).flatten(0, 1)
+
+
+def _passable(roadmap: Roadmap, paths: Tensor) -> Tensor:
+    """(C,) paths (C, M, width) on which the map has certified configurations everywhere, neighbours near each other."""
+    q = roadmap.solve(paths)
+    good = torch.from_numpy((q.status == "solved").all(1))
+    steps = difference(q.configurations[:, :-1], q.configurations[:, 1:], roadmap.robot.continuous)
+    return good & (steps.norm(dim=2) < _APART).all(1).cpu()

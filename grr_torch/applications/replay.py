@@ -1,0 +1,81 @@
+"""Teleoperation along waypoints that are there beforehand."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from grr_torch.applications.teleoperate import Teleoperator
+from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
+from grr_torch.errors import ParameterError
+from grr_torch.progress import Progress, silent
+from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.tables import read_points
+
+# after the last waypoint an arm has so long to arrive [s], and has arrived when its tool is so near [m]
+_MORE_SECONDS, _ARRIVED = 2.0, 1e-3
+
+
+def read_waypoints(path: str | os.PathLike[str], width: int) -> Tensor:
+    """Waypoints (N, width) [m], one a row of a .csv, with or without a header, .npy or .parquet.
+
+    Raises:
+        ParameterError: The suffix is not known.
+        FileFormatError: It is missing, no such table, of another width, or has values that are not finite.
+    """
+    return torch.from_numpy(np.concatenate(list(read_points(Path(path), width))))
+
+
+def replay(
+    roadmap: Roadmap,
+    waypoints: Tensor,
+    rate: float = 50.0,
+    *,
+    max_step: float | None = None,
+    acceleration_limits: float | None = None,
+    progress: Progress = silent,
+) -> TeleoperationLog:
+    """Lets one arm follow waypoints, one target for each control step, from the first one on.
+
+    After the last waypoint the arm has up to two more seconds to arrive.
+
+    Args:
+        roadmap: The roadmap.
+        waypoints: (N, width) targets [m].
+        rate: Control steps in a second [Hz].
+        max_step: As for `Teleoperator`.
+        acceleration_limits: As for `Teleoperator`.
+        progress: Told how many steps are done.
+
+    Raises:
+        ParameterError: There is no waypoint, one is not finite, they are not of the task's width, or a parameter is
+            out of its range.
+    """
+    width = roadmap.task.width
+    if waypoints.ndim != 2 or waypoints.shape[1] != width or len(waypoints) == 0:
+        raise ParameterError("waypoints", tuple(waypoints.shape), f"(1 or more, {width})")
+    if not bool(waypoints.isfinite().all()):
+        raise ParameterError("waypoints", "NaN or infinite values", "finite values")
+    robot, d = roadmap.robot, roadmap.task.dimension
+    teleoperator = Teleoperator(roadmap, rate, max_step=max_step, acceleration_limits=acceleration_limits)
+    log = TeleoperationLog(roadmap, rate)
+    total = len(waypoints) + round(_MORE_SECONDS * rate)
+    for k in range(total):
+        progress("following", k, total)
+        target = waypoints[min(k, len(waypoints) - 1)]
+        start = time.perf_counter()
+        command = teleoperator.step(target)
+        seconds = time.perf_counter() - start
+        q = command.configuration
+        clearance = float(robot.self_collision_distance(q)) - robot.margin
+        log.append(Step(k / rate, tuple(target.tolist()), q, str(command.status), clearance, seconds))
+        tool = robot.forward_kinematics(q)[0][:d].cpu()
+        if k >= len(waypoints) - 1 and float((tool - target[:d]).norm()) <= _ARRIVED:
+            break
+    progress("following", total, total)
+    return log

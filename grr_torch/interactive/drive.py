@@ -1,0 +1,27 @@
+"""The control loop of a session."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from threading import Event
+
+from grr_torch.applications.teleoperation_log import Step
+from grr_torch.interactive.session import Session
+
+
+def drive(session: Session, show: Callable[[Step], None], stop: Event) -> None:
+    """Lets a session tick at its rate until it is stopped.
+
+    A step that comes late is not made up for: the arm then moves more slowly, never faster.
+
+    Args:
+        session: The session.
+        show: Told of every step; it must not wait.
+        stop: Ends the loop.
+    """
+    start = due = time.perf_counter()
+    while not stop.is_set():
+        show(session.tick(time.perf_counter() - start))
+        due = max(due + 1.0 / session.rate, time.perf_counter())
+        stop.wait(due - time.perf_counter())

@@ -1,0 +1,143 @@
+"""A person and an arm: the target that the one moves and the control steps of the other. It knows no browser."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from grr_torch.applications.example_paths import middles
+from grr_torch.applications.teleoperate import Teleoperator
+from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
+from grr_torch.errors import ParameterError
+from grr_torch.resolution.roadmap import Roadmap
+
+# a target may leave what is resolved by this share of its size
+_BEYOND = 0.25
+
+
+class Session:
+    """One arm that follows a target which others move.
+
+    `tick` is called at the control rate by one thread; the target may be moved, and the clutch let go, by another.
+
+    Attributes:
+        roadmap: The roadmap.
+        rate: Control steps in a second [Hz].
+        low: (width,) lower bounds of the target [m].
+        high: (width,) upper bounds of the target [m].
+        home: (width,) where the target starts [m].
+        log: All steps.
+    """
+
+    def __init__(
+        self,
+        roadmap: Roadmap,
+        rate: float = 50.0,
+        *,
+        max_step: float | None = None,
+        acceleration_limits: float | None = None,
+    ) -> None:
+        """The arm stands in the middle of its roadmap.
+
+        Args:
+            roadmap: The roadmap.
+            rate: Control steps in a second [Hz].
+            max_step: As for `Teleoperator`.
+            acceleration_limits: As for `Teleoperator`.
+
+        Raises:
+            ParameterError: A parameter is out of its range, or no vertex is resolved.
+        """
+        self.roadmap, self.rate = roadmap, rate
+        self.home = middles(roadmap)[0]
+        vertex = (roadmap.points - self.home).norm(dim=1).argmin()
+        self.teleoperator = Teleoperator(
+            roadmap,
+            rate,
+            start=roadmap.configurations[vertex].to(roadmap.robot.lower),
+            max_step=max_step,
+            acceleration_limits=acceleration_limits,
+        )
+        resolved = roadmap.points[roadmap.resolved]
+        low, high = resolved.amin(0), resolved.amax(0)
+        self.low, self.high = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
+        self.log = TeleoperationLog(roadmap, rate)
+        self._target = self.tool = tuple(self.home.tolist())
+        self._engaged, self._rearm = True, False
+
+    @property
+    def configuration(self) -> Tensor:
+        """(n,) where the arm was last sent, not wrapped [rad or m]."""
+        q = self.teleoperator.configuration
+        assert q is not None
+        return q
+
+    @property
+    def target(self) -> tuple[float, ...]:
+        """(width,) the target [m]."""
+        return self._target
+
+    @property
+    def engaged(self) -> bool:
+        """Whether the arm follows. While the clutch is let go it stands still, wherever the target goes."""
+        return self._engaged
+
+    def move(self, target: Sequence[float]) -> None:
+        """Moves the target; one beyond the bounds is put on them.
+
+        Raises:
+            ParameterError: It is not finite, or not of the task's width.
+        """
+        given = torch.tensor([float(value) for value in target], dtype=torch.float64)
+        if given.shape != self.low.shape or not bool(given.isfinite().all()):
+            raise ParameterError("target", tuple(target), f"{len(self.low)} finite numbers, in metres")
+        self._target = tuple(given.clamp(self.low, self.high).tolist())
+
+    def nudge(self, axis: int, distance: float) -> None:
+        """Moves the target along one axis [m]."""
+        moved = list(self._target)
+        moved[axis] += distance
+        self.move(moved)
+
+    def go_home(self) -> None:
+        """Puts the target back to where it started."""
+        self._target = tuple(self.home.tolist())
+
+    def reset(self) -> None:
+        """Puts the target to the tool, so that the arm stops, and forgets the last one."""
+        self._target, self._rearm = self.tool, True
+
+    def let_go(self) -> None:
+        """Lets the clutch go: the arm stops, and the target may be moved to anywhere."""
+        self._engaged = False
+
+    def engage(self) -> None:
+        """Engages the clutch: the target jumps to the tool, and the arm follows it again."""
+        self.reset()
+        self._engaged = True
+
+    def tick(self, at: float | None = None) -> Step:
+        """One control step.
+
+        Args:
+            at: When it is, from the start [s]; by default the steps so far over the rate.
+        """
+        if self._rearm:
+            self._rearm = False
+            self.teleoperator.reset()
+        target, robot = self._target, self.roadmap.robot
+        start = time.perf_counter()
+        if self._engaged:
+            command = self.teleoperator.step(torch.tensor(target, dtype=torch.float64))
+            q, status = command.configuration, str(command.status)
+        else:
+            q, status = self.configuration, "holding"
+        seconds = time.perf_counter() - start
+        self.tool = tuple(robot.forward_kinematics(q)[0][: self.roadmap.task.dimension].tolist())
+        clearance = float(robot.self_collision_distance(q)) - robot.margin
+        step = Step(len(self.log) / self.rate if at is None else at, target, q, status, clearance, seconds)
+        self.log.append(step)
+        return step
