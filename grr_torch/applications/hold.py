@@ -11,8 +11,8 @@ from grr_torch.applications.solve import Solver
 from grr_torch.spaces.configuration import distance
 
 # metres around the last such point that are searched in a step, and the shares of it that are tried
-_AROUND = 0.05
-_SHARES = (1.0, 0.4, 0.15, 0.05)
+_AROUND = 0.2
+_SHARES = (1.0, 0.5, 0.25, 0.1, 0.03)
 # directions across, in space, and how much they lean to the target
 _SIDES = 8
 _LEANS = (0.5, 0.0, -0.5)
