@@ -12,9 +12,9 @@ from grr_torch.spaces.configuration import distance
 
 # metres around the last such point that are searched in a step, and the shares of it that are tried
 _AROUND = 0.2
-_SHARES = (1.0, 0.5, 0.25, 0.1, 0.03)
+_SHARES = (1.0, 0.35, 0.12, 0.03)
 # directions across, in space, and how much they lean to the target
-_SIDES = 8
+_SIDES = 6
 _LEANS = (0.5, 0.0, -0.5)
 # a step between neighbouring points may change the configuration by so much a metre [rad/m], and so much in all [rad]
 _SLOPE = 30.0
@@ -48,12 +48,13 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     directions = apart[:, None, None] * _directions(targets - base)
     steps = torch.cat([share * directions for share in _SHARES], dim=1)
     points = torch.cat([base[:, None], base[:, None] + steps], dim=1)
-    columns, codes = solver.solve_columns(points.reshape(-1, width).T.contiguous())
+    flat = points.reshape(-1, width)
+    guesses, codes = solver.guess(flat.cpu())
+    columns, codes = solver.solve_from(flat.T.contiguous(), guesses, codes)
     q = columns.T.reshape(count, points.shape[1], -1)
     # near full stretch, much joint motion brings little
-    guesses = solver.guess(points.reshape(-1, width).cpu())[0].to(q).reshape(q.shape)
-    fits = (codes <= 1).to(base.device).reshape(count, -1)
-    fits &= distance(q, guesses, solver.robot.continuous) <= _STRETCHED
+    fits = (codes <= 1).to(q.device).reshape(count, -1)
+    fits &= distance(q, guesses.to(q).reshape(q.shape), solver.robot.continuous) <= _STRETCHED
     known = base_q.isfinite().all(1)
     reach = _SLOPE * (points - base[:, None]).norm(dim=2) + _LEAST
     moved = torch.where(known[:, None], distance(q, base_q[:, None].nan_to_num(), solver.robot.continuous), 0.0)

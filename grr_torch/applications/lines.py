@@ -17,9 +17,11 @@ from grr_torch.spaces.task import TaskSpace
 # configurations between two steps at which self-collision is checked, the second step's own included
 SUBSTEPS = 8
 # a line of more pieces is not followed at once
-_MOST_PIECES = 32
+_MOST_PIECES = 24
 # a gap between points on a line of so many ε is one to another posture, whatever joins them
 _WIDEST = 2.0
+# lines no longer than this may have such gaps [rad]: it takes time to look into them
+_BRIDGED = 1.5
 # of the longest step, so that what the projection adds seldom has to be cut off
 _SLACK = 0.98
 
@@ -86,7 +88,8 @@ class Follower:
         motion = difference(q, guesses, robot.continuous)
         share = _SLACK * (self.longest / motion.abs().clamp_min(1e-12)).amin(1)
         near = share >= _SLACK
-        pieces = (2.0 * motion.norm(dim=1) / self.epsilon).ceil().clamp_min(2.0)
+        length = motion.norm(dim=1)
+        pieces = (2.0 * length / self.epsilon).ceil().clamp_min(2.0)
         short = pieces <= _MOST_PIECES
         count = int(pieces[short].max()) if bool(short.any()) else 2
         inner = torch.arange(1, count, dtype=q.dtype, device=q.device) / count
@@ -117,7 +120,7 @@ class Follower:
         hit = self._hits(torch.cat([found[:, :-2], ends[:, None]], dim=1), q, steps)
         safe = torch.where(near, reached[:, -1], reached[:, -2]) & ~hit[:, count:].any(1)
         direct = short & safe & reached[:, : count - 1].all(1) & reached[:, -1] & ~hit[:, :count].any(1)
-        direct &= (gaps < _WIDEST * self.epsilon).all(1)
+        direct &= (gaps < torch.where(length <= _BRIDGED, _WIDEST, 1.0)[:, None] * self.epsilon).all(1)
         if bool((direct[:, None] & wide).any()):
             stops = torch.cat([torch.zeros_like(inner[:1]), inner, torch.ones_like(inner[:1])])
             along = self.task.interpolate(p[:, None], targets[:, None], stops[:, None])

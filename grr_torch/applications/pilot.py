@@ -22,6 +22,8 @@ TRACKING, DETOURING, HOLDING, UNREACHABLE = range(4)
 _ENTRIES = 6
 _ENDS = 8
 _WAYS_BACK = 32
+# metres that a goal moves before the last vertex of the route to it is looked for again
+_SAME_GOAL = 0.03
 # more than any distance of configurations [rad]
 _NOT_JOINED = 1e3
 # an arm so near [rad or m] to a vertex's configuration is at the vertex
@@ -59,6 +61,8 @@ class Arms:
         on_task: (B,) arms that meet their task's rotation and the joint limits and are free of self-collision.
         held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
         held_q: (B, n) configurations there.
+        last_vertex: (B,) the last vertex of a route, and
+        last_goal: (B, width) the goal it belongs to; NaN where there is none.
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
     """
 
@@ -68,6 +72,8 @@ class Arms:
     on_task: Tensor
     held: Tensor
     held_q: Tensor
+    last_vertex: Tensor
+    last_goal: Tensor
     next_vertex: Tensor
 
     @staticmethod
@@ -75,7 +81,8 @@ class Arms:
         """Arms that stand at configurations (B, n)."""
         nothing = q.new_full((len(q), follower.task.width), torch.nan)
         off, no_vertex = torch.zeros(len(q), dtype=torch.bool), torch.full((len(q),), -1)
-        arms = Arms(q, torch.zeros_like(q), nothing, off, nothing.clone(), q * torch.nan, no_vertex)
+        held, last_goal = nothing.clone(), nothing.clone()
+        arms = Arms(q, torch.zeros_like(q), nothing, off, held, q * torch.nan, no_vertex.clone(), last_goal, no_vertex)
         arms.look(follower, torch.arange(len(q)))
         return arms
 
@@ -158,15 +165,20 @@ class Pilot:
     def _route(self, arms: Arms, which: Tensor, goals: Tensor, goals_q: Tensor) -> tuple[Tensor, Tensor]:
         """Steps (A, n) of arms on shortest paths to goals, and which found no way (A,)."""
         result, left = arms.q[which].clone(), torch.ones(len(which), dtype=torch.bool)
-        ends = self._last_vertices(goals, goals_q)
-        entries = self.solver.nearest(arms.p[which].cpu(), _ENTRIES)[1]
+        moved = ~((goals - arms.last_goal[which]).norm(dim=1) <= _SAME_GOAL)
+        if bool(moved.any()):
+            arms.last_goal[which[moved]] = goals[moved]
+            arms.last_vertex[which[moved]] = torch.tensor(self._last_vertices(goals[moved], goals_q[moved]))
+        ends = arms.last_vertex[which].tolist()
         for fresh in (False, True):
             # where the next vertex of a route cannot be gone to any more, a new way in is looked for
             rows = (left & ((arms.next_vertex[which] >= 0) | fresh)).nonzero()[:, 0].tolist()
+            entries = self.solver.nearest(arms.p[which].cpu(), _ENTRIES)[1] if fresh and rows else None
             tried: list[tuple[int, int, float, bool]] = []
             for row in rows:
                 cost, following = self.routes.towards(ends[row])
-                ahead = entries[row].tolist() if fresh else _ahead(int(arms.next_vertex[which[row]]), following)
+                current = int(arms.next_vertex[which[row]])
+                ahead = _ahead(current, following) if entries is None else entries[row].tolist()
                 on_edge = 0 if fresh else 1 + self._arrived(arms, int(which[row]))
                 tried += [(row, v, float(cost[v]), k < on_edge) for k, v in enumerate(ahead) if cost[v] < float("inf")]
             if tried:

@@ -103,10 +103,12 @@ class Solver:
 
     def solve_columns(self, targets: Tensor) -> tuple[Tensor, Tensor]:
         """Configurations (n, N), NaN where not valid, and indices into STATUSES (N,) for points (width, N)."""
-        points = targets.T.cpu().to(torch.float64)
-        guesses, codes = self.guess(points)
+        return self.solve_from(targets, *self.guess(targets.T.cpu().to(torch.float64)))
+
+    def solve_from(self, targets: Tensor, guesses: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
+        """`solve_columns` from what `guess` gave."""
         near = (codes <= _UNCERTIFIED).nonzero()[:, 0].to(targets.device)
-        q = targets.new_full((self.robot.n, len(points)), torch.nan)
+        q = targets.new_full((self.robot.n, len(guesses)), torch.nan)
         solved, valid = project_columns(
             self.robot,
             self.task,
