@@ -31,7 +31,7 @@ def _bench() -> None:
 def speed(
     only: Annotated[
         list[str] | None,
-        typer.Option(help="kinematics, projection, self-collision, build, process or growth; repeatable."),
+        typer.Option(help="kinematics, projection, self-collision, build, process, growth or use; repeatable."),
     ] = None,
     peers: Annotated[
         str | None, typer.Option(help="Of pytorch-kinematics,Pinocchio,Klampt; by default those that are installed.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -23,6 +24,8 @@ _LEAST = 0.05
 _WORTH = 0.02
 # a configuration farther than this from its neighbours' average is near full stretch [rad]
 _STRETCHED = 0.5
+# of the projections: what takes longer is no point to hold at
+_ITERATIONS = 8
 # a vertex is gone to instead when it is so much nearer, as a share of the distance
 _NEARER = 0.8
 
@@ -50,7 +53,9 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     points = torch.cat([base[:, None], base[:, None] + steps], dim=1)
     flat = points.reshape(-1, width)
     guesses, codes = solver.guess(flat.cpu())
-    columns, codes = solver.solve_from(flat.T.contiguous(), guesses, codes)
+    columns, codes = solver.solve_from(
+        flat.T.contiguous(), guesses, codes, replace(solver.tolerances, iterations=_ITERATIONS)
+    )
     q = columns.T.reshape(count, points.shape[1], -1)
     # near full stretch, much joint motion brings little
     fits = (codes <= 1).to(q.device).reshape(count, -1)

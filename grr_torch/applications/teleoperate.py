@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from grr_torch.projection.project import Tolerances
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
+# of projections along lines, whose guesses are near; what takes longer is not to be gone to in a control step
+_ITERATIONS = 10
 # what a status says, by the pilot's codes
 STATUSES = np.array(["tracking", "detouring", "holding", "unreachable"])
 
@@ -91,7 +93,7 @@ class Teleoperator:
         self._gain = None
         if acceleration_limits is not None:
             self._gain = _per_joint("acceleration_limits", acceleration_limits, robot.lower) / rate**2
-        tolerances = Tolerances(**roadmap.parameters["tolerances"])
+        tolerances = replace(Tolerances(**roadmap.parameters["tolerances"]), iterations=_ITERATIONS)
         self._follower = Follower(robot, roadmap.task, tolerances, longest)
         self._pilot = Pilot(self._follower, roadmap.solver, Routes(roadmap))
         self._batch: torch.Size = torch.Size()

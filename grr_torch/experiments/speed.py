@@ -20,6 +20,7 @@ from grr_torch.experiments.peers import (
 )
 from grr_torch.experiments.projection_cost import AnyPose, PoseProblem
 from grr_torch.experiments.timing import in_fresh_process, machine, median_process_seconds, median_seconds
+from grr_torch.experiments.use_speed import measure_use
 from grr_torch.pieces import in_pieces
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import DEFAULT_TOLERANCES, project_columns
@@ -219,6 +220,15 @@ def _growth(bench: _Bench) -> Iterator[Row]:
         yield Row(f"build, kinova position, {vertices:,} vertices", "µs a vertex", 1e6 * seconds / vertices, {}, more)
 
 
+def _use(bench: _Bench) -> Iterator[Row]:
+    figures = measure_use(build(bench.robot, "fixed-rotation"), bench.repeats)
+    more = {"valid": figures.valid, "one point alone, µs": 1e6 * figures.one_point}
+    yield Row("solve, kinova fixed-rotation, N = 100,000", "points / s", figures.points_per_second, {}, more)
+    p99 = {"99th percentile": 1e3 * figures.step_p99}
+    yield Row("teleoperation, one arm, paths of all kinds", "ms a step", 1e3 * figures.step_median, {}, p99)
+    yield Row("teleoperation, 100 arms, random lines", "ms an arm and step", 1e3 * figures.arm_step)
+
+
 def _grow(points: int, device: str) -> tuple[int, float]:
     """How many vertices, and how long their build takes [s]."""
     robot = load_robot("kinova", device=device)
@@ -234,4 +244,5 @@ SECTIONS: dict[str, Callable[[_Bench], Iterator[Row]]] = {
     "build": _builds,
     "process": _processes,
     "growth": _growth,
+    "use": _use,
 }
