@@ -25,7 +25,7 @@ _WORTH = 0.02
 # a configuration farther than this from its neighbours' average is near full stretch [rad]
 _STRETCHED = 0.5
 # of the projections: what takes longer is no point to hold at
-_ITERATIONS = 8
+_ITERATIONS = 5
 # a vertex is gone to instead when it is so much nearer, as a share of the distance
 _NEARER = 0.8
 

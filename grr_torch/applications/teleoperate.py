@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
 # of projections along lines, whose guesses are near; what takes longer is not to be gone to in a control step
-_ITERATIONS = 10
+_ITERATIONS = 6
 # what a status says, by the pilot's codes
 STATUSES = np.array(["tracking", "detouring", "holding", "unreachable"])
 
