@@ -2,11 +2,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import hypothesis
 import pytest
 import torch
 from random_robots import BOX_ARM
 
 import grr_torch
+
+# how long an example takes is the machine's affair
+hypothesis.settings.register_profile("any machine", deadline=None)
+hypothesis.settings.load_profile("any machine")
 
 REAL_MESHES = Path(__file__).resolve().parents[2] / "shared" / "meshes"
 

@@ -167,7 +167,7 @@ def test_a_replay_of_one_waypoint_and_of_an_unreachable_one(roadmap):
     summary = log.summary()
     assert summary.steps == 102
     assert summary.shares["tracking"] < 0.1
-    assert log.status[-1] in ("unreachable", "holding")
+    assert log.status[-1] != "tracking"
     for wrong in (home[:0], home[0], home[:, :1], home * torch.nan):
         with pytest.raises(ParameterError, match="waypoints"):
             replay(roadmap, wrong)

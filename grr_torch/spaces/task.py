@@ -97,7 +97,7 @@ class TaskSpace(ABC):
         """
         d = self.dimension
         translation = start[..., :d] + fraction * (end[..., :d] - start[..., :d])
-        if self.width == d:
+        if start.shape[-1] == d:
             return translation
         orientations = self.quaternions(start), self.quaternions(end)
         if orientations[0] is None or orientations[1] is None:
