@@ -97,7 +97,7 @@ def per_joint(name: str, value: float | Tensor, like: Tensor) -> Tensor:
     Raises:
         ParameterError: It is not positive, or not one number or n of them.
     """
-    given = torch.as_tensor(value, dtype=like.dtype)
+    given = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     if given.shape not in (torch.Size(), like.shape) or not bool(((given > 0.0) & given.isfinite()).all()):
         raise ParameterError(name, value, f"one finite number above 0, or {len(like)} of them")
     return given.expand(len(like)).clone()

@@ -13,6 +13,7 @@ from torch import Tensor
 from grr_torch.applications.braking import limit_acceleration
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.pilot import HOLDING, Arms, Pilot
+from grr_torch.applications.retime import per_joint, usual_speeds
 from grr_torch.applications.routes import Routes
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
@@ -73,7 +74,7 @@ class Teleoperator:
             start: (*batch, n) where the arms stand, as measured; by default at the first target's configuration on
                 the map, or at the nearest resolved vertex where it has none.
             max_step: The most that a joint moves in a step [rad or m], one number or (n,); by default the robot's
-                velocity limits over the rate.
+                velocity limits over the rate, 1 rad/s or 1 m/s where it has none.
             acceleration_limits: Of the joints [rad/s² or m/s²], one number or (n,); by default none. An arm that has
                 them never moves so fast that it could not stop free of self-collision.
             max_jump: A target farther from the last one than this [m] is refused, until `reset`.
@@ -89,10 +90,14 @@ class Teleoperator:
             if not value > 0.0:
                 raise ParameterError(name, value, "above 0")
         self.roadmap, self.rate, self.max_jump, self.timeout = roadmap, rate, max_jump, timeout
-        longest = robot.velocity_limits / rate if max_step is None else _per_joint("max_step", max_step, robot.lower)
+        longest = (
+            usual_speeds(robot.velocity_limits) / rate
+            if max_step is None
+            else per_joint("max_step", max_step, robot.lower)
+        )
         self._gain = None
         if acceleration_limits is not None:
-            self._gain = _per_joint("acceleration_limits", acceleration_limits, robot.lower) / rate**2
+            self._gain = per_joint("acceleration_limits", acceleration_limits, robot.lower) / rate**2
         tolerances = replace(Tolerances(**roadmap.parameters["tolerances"]), iterations=_ITERATIONS)
         self._follower = Follower(robot, roadmap.task, tolerances, longest)
         self._pilot = Pilot(self._follower, roadmap.solver, Routes(roadmap))
@@ -197,15 +202,3 @@ class Teleoperator:
         behind = self._now - time
         self._freshest = min(self._freshest, behind)
         return behind - self._freshest <= self.timeout
-
-
-def _per_joint(name: str, value: float | Tensor, like: Tensor) -> Tensor:
-    """One positive number for each joint (n,).
-
-    Raises:
-        ParameterError: It is not positive, or not one number or n of them.
-    """
-    given = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-    if given.shape not in (torch.Size(), like.shape) or not bool((given > 0.0).all()):
-        raise ParameterError(name, value, f"one number above 0, or {len(like)} of them")
-    return given.expand(len(like)).clone()

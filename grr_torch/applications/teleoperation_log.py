@@ -19,7 +19,7 @@ from grr_torch.output import atomic_write
 from grr_torch.resolution.roadmap import Roadmap
 
 # an arm stalls when no joint moves more than this in a step [rad or m] though its tool is farther away than that [m]
-_STILL, _AWAY = 1e-4, 0.01
+STILL, AWAY = 1e-4, 0.01
 
 TRAJECTORY_SUFFIXES = (".csv", ".npy", ".npz")
 
@@ -150,13 +150,13 @@ class TeleoperationLog:
         motion, deviations = self.configurations.diff(dim=0).abs().amax(1), self.deviations
         clearance = float(self.clearances.min())
         status = self.status
-        still = (motion <= _STILL) & (deviations[1:] > _AWAY)
+        still = (motion <= STILL) & (deviations[1:] > AWAY)
         return Summary(
             steps=len(self),
             seconds=float(self.times[-1]),
             shares={name: float((status == name).mean()) for name in STATUSES.tolist()},
             joint_step=float(motion.max()) if len(motion) else 0.0,
-            stall=_longest(still, self.times.diff()),
+            stall=longest_time(still, self.times.diff()),
             clearance=clearance if np.isfinite(clearance) else None,
             deviation=float(deviations.mean()),
             largest_deviation=float(deviations.max()),
@@ -209,7 +209,7 @@ def check_trajectory_path(path: str | os.PathLike[str]) -> None:
         raise ParameterError("trajectory file", path, f"a name that ends in {', '.join(TRAJECTORY_SUFFIXES)}")
 
 
-def _longest(flags: Tensor, durations: Tensor) -> float:
+def longest_time(flags: Tensor, durations: Tensor) -> float:
     """The longest time for which steps in a row are flagged [s]."""
     longest = running = 0.0
     for flag, duration in zip(flags.tolist(), durations.tolist(), strict=True):

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from grr_torch.applications.teleoperation_log import AWAY, STILL, longest_time
 from grr_torch.errors import MissingPackageError
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.spaces.configuration import difference
@@ -16,8 +17,6 @@ from grr_torch.spaces.configuration import difference
 _NEAR_POSITION, _NEAR_ROTATION = 0.1, 0.1
 # configurations between two steps at which self-collision is looked for
 _SUBSTEPS = 8
-# an arm stalls when no joint moves more than this in a step [rad or m] though its tool is farther away than that [m]
-_STILL, _AWAY = 1e-4, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ def _measure_one(roadmap: Roadmap, path: Tensor, q: Tensor, rate: float, closed:
     travelled = float(position[:, :d].diff(dim=0).norm(dim=1).sum())
     fractions = torch.arange(1, _SUBSTEPS + 1, dtype=q.dtype)[:, None, None] / _SUBSTEPS
     collides = bool(robot.in_self_collision(q[:-1] + fractions * motion).any())
-    still = (motion.abs().amax(1) <= _STILL) & (errors[0][1:] > _AWAY)
+    still = (motion.abs().amax(1) <= STILL) & (errors[0][1:] > AWAY)
     near = float(final[0]) <= _NEAR_POSITION and float(final[1]) <= _NEAR_ROTATION
     back = difference(q[0], q[-1], robot.continuous.cpu()).abs().max()
     return {
@@ -92,7 +91,7 @@ def _measure_one(roadmap: Roadmap, path: Tensor, q: Tensor, rate: float, closed:
         "joint_step": float(motion.abs().max()) if len(motion) else 0.0,
         "acceleration": float(motion.diff(dim=0).abs().max()) * rate**2 if len(motion) > 1 else 0.0,
         "closure": float(back) if closed else float("nan"),
-        "stall": _longest_run(still.numpy()) / rate,
+        "stall": longest_time(still, torch.full_like(errors[0][1:], 1.0 / rate)),
     }
 
 
@@ -107,9 +106,3 @@ def _warped_distance(waypoints: np.ndarray, positions: np.ndarray) -> float:
     distances = cdist(waypoints, positions)
     matched = dtw(distances, step_pattern="symmetric1")
     return float(distances[matched.index1, matched.index2].mean())
-
-
-def _longest_run(flags: np.ndarray) -> int:
-    """Length of the longest run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0
