@@ -27,7 +27,7 @@ STATUSES = ("solved", "uncertified", "outside", "too far", "not converged", "off
 _SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_COLLISION = range(len(STATUSES))
 
 # points worked on together
-_AT_ONCE = 1 << 10
+_AT_ONCE = 1 << 12
 # a guess averages over so many vertices, in the plane and in space: a grid's first two shells
 _NEIGHBOURS = {2: 8, 3: 14}
 # the most vertices of which a matrix of neighbours is made: 16 MiB
