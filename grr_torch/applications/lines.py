@@ -145,10 +145,6 @@ class Follower:
         share = ((1.0 - 1e-12) * self.longest / motion.abs().clamp_min(1e-12)).amin(1).clamp_max(1.0)
         return q + share[:, None] * motion
 
-    def free(self, q: Tensor, ends: Tensor) -> Tensor:
-        """Whether straight joint-space motions (B, n) are free of self-collision at `SUBSTEPS` configurations: (B,)."""
-        return ~self._hits(q[:, None, :][:, :0], q, ends).any(1)
-
     def _hits(self, alone: Tensor, q: Tensor, ends: Tensor) -> Tensor:
         """Self-collisions (B, K + S) of configurations (B, K, n) and of those between `q` and `ends` (B, n)."""
         fractions = torch.arange(1, SUBSTEPS + 1, dtype=q.dtype, device=q.device) / SUBSTEPS

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -95,14 +97,23 @@ def _measure_one(roadmap: Roadmap, path: Tensor, q: Tensor, rate: float, closed:
     }
 
 
-def _warped_distance(waypoints: np.ndarray, positions: np.ndarray) -> float:
-    """Mean distance [m] over the pairs that dynamic time warping matches."""
+def warping() -> Callable[..., Any]:
+    """Dynamic time warping, from the library that does it.
+
+    Raises:
+        MissingPackageError: dtw-python is not installed.
+    """
     try:
         from dtw import dtw
     except ImportError as error:
         raise MissingPackageError("dtw-python", "bench", "the deviation from a path") from error
+    return dtw
+
+
+def _warped_distance(waypoints: np.ndarray, positions: np.ndarray) -> float:
+    """Mean distance [m] over the pairs that dynamic time warping matches."""
     from scipy.spatial.distance import cdist
 
     distances = cdist(waypoints, positions)
-    matched = dtw(distances, step_pattern="symmetric1")
+    matched = warping()(distances, step_pattern="symmetric1")
     return float(distances[matched.index1, matched.index2].mean())

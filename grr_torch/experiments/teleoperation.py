@@ -16,7 +16,7 @@ from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.baselines.newton_ik import NewtonIk
 from grr_torch.baselines.relaxed_ik import RelaxedIk
 from grr_torch.errors import ParameterError, UnknownNameError
-from grr_torch.experiments.metrics import Figures, measure
+from grr_torch.experiments.metrics import Figures, measure, warping
 from grr_torch.experiments.paths import CLOSED, KINDS, draw_paths
 from grr_torch.output import atomic_write
 from grr_torch.progress import Progress, silent
@@ -103,7 +103,9 @@ def run_teleoperation(
     Raises:
         UnknownNameError: No such method or kind.
         ParameterError: Paths do not fit the roadmap.
+        MissingPackageError: dtw-python is not installed.
     """
+    warping()  # known before minutes have passed
     for method in methods:
         if method not in METHODS:
             raise UnknownNameError("method", method, METHODS)
