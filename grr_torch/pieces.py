@@ -11,8 +11,8 @@ from torch import Tensor
 # configurations worked on together: few enough for the cache, enough that a torch call costs less than its arithmetic
 _ON_CPU = 3500
 _ON_GPU = 1 << 18
-# up to so many the number of torch calls is the cost, not the arithmetic
-FEW = 16
+# up to so many, on the CPU, the number of calls is the cost, not the arithmetic
+FEW = 100
 
 
 def piece(device: torch.device) -> int:
@@ -25,6 +25,11 @@ def slices(count: int, device: torch.device) -> list[slice]:
     pieces = -(-count // piece(device)) or 1
     width = max(1, -(-count // pieces))
     return [slice(start, start + width) for start in range(0, max(count, 1), width)]
+
+
+def are_few(columns: Tensor) -> bool:
+    """Whether there are so few columns (…, N), on the CPU, that calls of numpy are faster than those of torch."""
+    return columns.shape[-1] <= FEW and columns.device.type == "cpu"
 
 
 def in_pieces(function: Callable[..., tuple[Tensor, ...]], *columns: Tensor) -> tuple[Tensor, ...]:

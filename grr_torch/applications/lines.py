@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from grr_torch.projection.continuity import continuous_columns
 from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.robots.few_kinematics import Array
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.configuration import difference, distance
 from grr_torch.spaces.task import TaskSpace
 
 # configurations between two steps at which self-collision is checked, the second step's own included
@@ -50,6 +53,28 @@ class Lines:
     direct: Tensor
 
 
+class _Found(NamedTuple):
+    """What a projection of lines gave.
+
+    Attributes:
+        q: (B, n) where the arms stand.
+        near: (B,) lines that end within a step.
+        length: (B,) joint-space lengths [rad].
+        short: (B,) lines all of which was looked at.
+        found: (B, K + 1, n) configurations on the way, after the step, and at the end; NaN where not converged.
+        reached: (B, K + 1) converged.
+        after: (B, width) where the tools are after the steps.
+    """
+
+    q: Array
+    near: Array
+    length: Array
+    short: Array
+    found: Array
+    reached: Array
+    after: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Follower:
     """How arms follow lines.
@@ -84,49 +109,57 @@ class Follower:
             guesses: (B, n) guesses for the lines' ends.
             targets: (B, width) the ends.
         """
-        robot = self.robot
-        motion = difference(q, guesses, robot.continuous)
-        share = _SLACK * (self.longest / motion.abs().clamp_min(1e-12)).amin(1)
+        standing, wanted = q.numpy(), targets.numpy()
+        count = len(standing)
+        motion = self._difference(standing, guesses.numpy())
+        share = _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
         near = share >= _SLACK
-        length = motion.norm(dim=1)
-        pieces = (2.0 * length / self.epsilon).ceil().clamp_min(2.0)
+        length = _norm(motion)
+        pieces = np.maximum(np.ceil(2.0 * length / self.epsilon), 2.0)
         short = pieces <= _MOST_PIECES
-        count = int(pieces[short].max()) if bool(short.any()) else 2
-        inner = torch.arange(1, count, dtype=q.dtype, device=q.device) / count
-        fractions = torch.cat(
-            [inner.expand(len(q), -1), share.clamp_max(1.0)[:, None], torch.ones_like(share)[:, None]], 1
-        )
+        parts = int(pieces[short].max()) if short.any() else 2
+        # points on the way, the step, the end
+        fractions = np.ones((count, parts + 1), standing.dtype)
+        fractions[:, : parts - 1] = np.arange(1, parts) / parts
+        fractions[:, parts - 1] = np.minimum(share, 1.0)
         # what lies beyond the longest line is not looked at, but for the end
-        rows, columns = (short[:, None] | (torch.arange(count + 1) >= count - 1)).nonzero().unbind(1)
-        fraction = fractions[rows, columns][:, None]
-        points = self.task.interpolate(p[rows], targets[rows], fraction)
+        looked = short[:, None] | (np.arange(parts + 1) >= parts - 1)
+        rows = looked.nonzero()[0]
+        fraction = fractions[looked][:, None]
+        places = torch.from_numpy(p.numpy()[rows]), torch.from_numpy(wanted[rows])
+        on_way = self.task.interpolate(*places, torch.from_numpy(fraction))
+        starts = standing[rows] + fraction * motion[rows]
         solved, valid = project_columns(
-            robot,
-            self.task,
-            points.T.contiguous(),
-            (q[rows] + fraction * motion[rows]).T.contiguous(),
-            self.tolerances,
-            check_collision=False,
+            self.robot, self.task, on_way.T, torch.from_numpy(starts.T), self.tolerances, check_collision=False
         )
-        found = q.new_full((len(q), count + 1, robot.n), torch.nan)
-        found[rows, columns] = solved.T
-        reached = torch.zeros(len(q), count + 1, dtype=torch.bool, device=q.device)
-        reached[rows, columns] = valid
-        ends = found[:, -1]
-        steps = self.limited(q, torch.where(near[:, None], ends, found[:, -2]))
-        chain = torch.cat([q[:, None], found[:, :-2], ends[:, None]], dim=1)
-        gaps = distance(chain[:, :-1], chain[:, 1:], robot.continuous)
+        found = np.full((count, parts + 1, self.robot.n), np.nan, standing.dtype)
+        found[looked] = solved.T.numpy()
+        reached = np.zeros((count, parts + 1), dtype=bool)
+        reached[looked] = valid.numpy()
+        after = wanted.copy()
+        after[~near] = on_way.numpy()[np.cumsum(looked)[parts - 1 :: parts + 1][~near] - 1]
+        return self._judge(_Found(standing, near, length, short, found, reached, after), p, targets)
+
+    def _judge(self, made: _Found, p: Tensor, targets: Tensor) -> Lines:
+        """Which of the lines that were projected can be followed."""
+        q, near, length, short, found, reached, after = made
+        parts = found.shape[1] - 1
+        ends, way = found[:, -1], found[:, :-2]
+        steps = self._limited(q, np.where(near[:, None], ends, found[:, -2]))
+        chain = np.concatenate([q[:, None], way, ends[:, None]], axis=1)
+        gaps = _norm(self._difference(chain[:, :-1], chain[:, 1:]))
         wide = ~(gaps < self.epsilon)
-        hit = self._hits(torch.cat([found[:, :-2], ends[:, None]], dim=1), q, steps)
-        safe = torch.where(near, reached[:, -1], reached[:, -2]) & ~hit[:, count:].any(1)
-        direct = short & safe & reached[:, : count - 1].all(1) & reached[:, -1] & ~hit[:, :count].any(1)
-        direct &= (gaps < torch.where(length <= _BRIDGED, _WIDEST, 1.0)[:, None] * self.epsilon).all(1)
-        if bool((direct[:, None] & wide).any()):
-            stops = torch.cat([torch.zeros_like(inner[:1]), inner, torch.ones_like(inner[:1])])
+        hit = self._hits(chain[:, 1:], q, steps)
+        safe = np.where(near, reached[:, -1], reached[:, -2]) & ~hit[:, parts:].any(1)
+        direct = short & safe & reached[:, : parts - 1].all(1) & reached[:, -1] & ~hit[:, :parts].any(1)
+        direct &= (gaps < np.where(length <= _BRIDGED, _WIDEST, 1.0)[:, None] * self.epsilon).all(1)
+        bridged = direct[:, None] & wide
+        if bridged.any():
+            stops = torch.arange(parts + 1, dtype=p.dtype) / parts
             along = self.task.interpolate(p[:, None], targets[:, None], stops[:, None])
-            direct &= self._bridged(chain, along, direct[:, None] & wide)
-        after = torch.where(near[:, None], targets, self.task.interpolate(p, targets, share.clamp_max(1.0)[:, None]))
-        return Lines(ends, steps, after, reached[:, -1], hit[:, count - 1], safe, direct)
+            direct &= self._bridged(torch.from_numpy(chain), along, torch.from_numpy(bridged)).numpy()
+        tensors = (ends, steps, after, reached[:, -1], hit[:, parts - 1], safe, direct)
+        return Lines(*(torch.from_numpy(np.ascontiguousarray(array)) for array in tensors))
 
     def _bridged(self, chain: Tensor, points: Tensor, wide: Tensor) -> Tensor:
         """Lines (B,) that are continuous where neighbouring points (B, K + 1, …) of them are far apart (B, K)."""
@@ -141,14 +174,38 @@ class Follower:
 
     def limited(self, q: Tensor, towards: Tensor) -> Tensor:
         """Configurations (B, n) towards others by at most a step, continuous joints not wrapped."""
-        motion = difference(q, towards, self.robot.continuous)
-        share = ((1.0 - 1e-12) * self.longest / motion.abs().clamp_min(1e-12)).amin(1).clamp_max(1.0)
-        return q + share[:, None] * motion
+        return torch.from_numpy(self._limited(q.numpy(), towards.numpy()))
 
-    def _hits(self, alone: Tensor, q: Tensor, ends: Tensor) -> Tensor:
+    def _limited(self, q: Array, towards: Array) -> Array:
+        motion = self._difference(q, towards)
+        share = ((1.0 - 1e-12) * self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
+        return q + np.minimum(share, 1.0)[:, None] * motion
+
+    def _difference(self, start: Array, end: Array) -> Array:
+        """`configuration.difference` of arrays."""
+        motion = end - start
+        per_turn, turn = self._turns
+        return motion - turn * np.round(motion * per_turn)
+
+    def _hits(self, alone: Array, q: Array, ends: Array) -> Array:
         """Self-collisions (B, K + S) of configurations (B, K, n) and of those between `q` and `ends` (B, n)."""
-        fractions = torch.arange(1, SUBSTEPS + 1, dtype=q.dtype, device=q.device) / SUBSTEPS
-        between = q[:, None] + fractions[:, None] * (ends - q)[:, None]
-        all_ = torch.cat([alone, between], dim=1)
-        columns = all_.reshape(-1, all_.shape[2]).T.contiguous()
-        return self.robot.columns_in_self_collision(columns).reshape(all_.shape[:2])
+        fractions = (np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS).astype(q.dtype)
+        between = q[:, None] + fractions * (ends - q)[:, None]
+        all_ = np.concatenate([alone, between], axis=1)
+        columns = np.ascontiguousarray(all_.reshape(-1, all_.shape[2]).T)
+        return self.robot.columns_in_self_collision(torch.from_numpy(columns)).numpy().reshape(all_.shape[:2])
+
+    @cached_property
+    def _longest(self) -> Array:
+        return self.longest.numpy()
+
+    @cached_property
+    def _turns(self) -> tuple[Array, Array]:
+        """1 / 2π and 2π of continuous joints, (n,) each; 0 of others, whose differences stay as they are."""
+        continuous = self.robot.continuous.numpy().astype(self._longest.dtype)
+        return continuous / (2.0 * math.pi), continuous * (2.0 * math.pi)
+
+
+def _norm(motion: Array) -> Array:
+    """Norms over the last axis; a fifth of the time that numpy.linalg's function takes."""
+    return np.sqrt((motion * motion).sum(-1))

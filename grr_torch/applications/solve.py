@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import embedding_bag
@@ -77,15 +78,21 @@ class Solver:
             raise ParameterError("roadmap", "one without a resolved vertex", "one to solve with")
         points = roadmap.points[:, : self.task.dimension]
         self.points, self.configurations, self.vertices = roadmap.points, roadmap.configurations, vertices
-        self.low, self.high = points.amin(0), points.amax(0)
+        self.low = points.amin(0)
+        slack = 1e-9
+        self._low, self._high = self.low.numpy() - slack, points.amax(0).numpy() + slack
         lengths = (points[roadmap.edges[:, 0]] - points[roadmap.edges[:, 1]]).norm(dim=1)
         self.radius = float(lengths.max()) if len(lengths) else math.inf
         self._tree = cKDTree(points[vertices].numpy())
-        self._embedded = embed(roadmap.configurations[vertices], self.robot.continuous.cpu())
-        self._ends = _neighbour_table(roadmap, vertices)
-        self._joined = _neighbour_matrix(self._ends) if len(vertices) <= _MATRIX else None
+        self._continuous = self.robot.continuous.cpu()
+        self._embedded = embed(roadmap.configurations[vertices], self._continuous)
+        ends = _neighbour_table(roadmap, vertices)
+        self._ends = ends.numpy()
+        self._joined = _neighbour_matrix(ends).numpy() if len(vertices) <= _MATRIX else None
         self._lattice = roadmap.graph.lattice
         self._suspect = self._uncertified_places(roadmap)
+        if self._suspect is not None:
+            self._near_suspect = self._near_uncertified(roadmap)
 
     def __call__(self, points: Tensor, *, progress: Progress = silent) -> Solution:
         """`Roadmap.solve`."""
@@ -137,24 +144,25 @@ class Solver:
 
         2n multiply-adds a neighbour, and k³ a doubling of the paths by which connected vertices are found.
         """
-        positions = points[:, : self.task.dimension]
+        positions = points[:, : self.task.dimension].numpy()
         k = min(_NEIGHBOURS[self.task.dimension], len(self.vertices))
         # the one after the k-th is at infinity where there is none
-        found = self._tree.query(positions.numpy(), k=range(1, k + 2))
-        distances, nearest = torch.from_numpy(found[0]), torch.from_numpy(found[1])[:, :k]
-        reach = distances[:, k:].clamp_max(_FARTHEST * self.radius)
-        weights = (reach / distances[:, :k].clamp_min(1e-12) - 1.0).clamp_min_(0.0).square_()
-        if not math.isfinite(self.radius):
-            weights = distances[:, :k].clamp_min(1e-12).square().reciprocal()
+        distances, nearest = self._tree.query(positions, k + 1)
+        near, nearest = np.maximum(distances[:, :k], 1e-12), nearest[:, :k]
+        if math.isfinite(self.radius):
+            reach = np.minimum(distances[:, k:], _FARTHEST * self.radius)
+            weights = np.square(np.maximum(reach / near - 1.0, 0.0))
+        else:
+            weights = 1.0 / np.square(near)
         weights *= self._largest_part(nearest)
-        sums = embedding_bag(nearest, self._embedded, per_sample_weights=weights, mode="sum")
-        codes = torch.full((len(points),), _SOLVED, dtype=torch.uint8)
-        if self._suspect is not None:
-            codes[self._suspect[self._place(positions, nearest[:, 0])]] = _UNCERTIFIED
+        sums = embedding_bag(
+            torch.from_numpy(nearest), self._embedded, per_sample_weights=torch.from_numpy(weights), mode="sum"
+        )
+        codes = np.full(len(points), _SOLVED, dtype=np.uint8)
+        self._mark_uncertified(codes, positions, nearest[:, 0])
         codes[(distances[:, 0] > self.radius) | ~(weights.sum(1) > 0.0)] = _TOO_FAR
-        slack = 1e-9
-        codes[((positions < self.low - slack) | (positions > self.high + slack)).any(1)] = _OUTSIDE
-        return average(sums, self.robot.continuous.cpu()), codes
+        codes[((positions < self._low) | (positions > self._high)).any(1)] = _OUTSIDE
+        return average(sums, self._continuous), torch.from_numpy(codes)
 
     def on_map(self, q: Tensor, guesses: Tensor) -> Tensor:
         """Whether configurations (N, n) are the map's, (N,), as far as the averages (N, n) that led to them tell.
@@ -163,8 +171,9 @@ class Solver:
         its vertices do not have. How far it went to reach the point does not count.
         """
         motion = difference(guesses, q, self.robot.continuous)
-        far = (motion.norm(dim=1) > _OFF_MAP).nonzero()[:, 0]
-        result = q.isfinite().all(1)
+        lengths = motion.square().sum(1)
+        far = (lengths > _OFF_MAP**2).nonzero()[:, 0]
+        result = lengths.isfinite()
         if len(far):
             columns = motion[far].T
             jacobian = self.task.jacobian(self.robot.tree.jacobian(self.robot.tree.frames(q[far].T.contiguous())))
@@ -179,36 +188,67 @@ class Solver:
         distances, index = self._tree.query(positions, k=range(1, min(k, len(self.vertices)) + 1))
         return torch.from_numpy(distances), self.vertices[torch.from_numpy(index)]
 
-    def _largest_part(self, nearest: Tensor) -> Tensor:
-        """Which of the vertices (N, k) lie in the largest part connected by edges among them; the nearest of equals."""
+    def _largest_part(self, nearest: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which of the vertices (N, k) lie in the largest part connected by edges among them; the nearest of equals.
+
+        A set of them is a number: vertex j is its bit j.
+        """
         k = nearest.shape[1]
         if self._joined is not None:
-            paths = self._joined[nearest[:, :, None], nearest[:, None, :]].float()
+            joined = self._joined[nearest[:, :, None], nearest[:, None, :]]
         else:
-            near = nearest.to(torch.int32)
-            paths = (self._ends[nearest][..., None] == near[:, None, None, :]).any(2).float()
-        paths.diagonal(dim1=1, dim2=2).fill_(1.0)
-        for _ in range(math.ceil(math.log2(max(k, 2)))):
-            paths = (paths @ paths).clamp_max_(1.0)
-        sizes = paths.sum(2) * k - torch.arange(k)
-        return paths[torch.arange(len(paths)), sizes.argmax(1)]
+            joined = (self._ends[nearest][..., None] == nearest[:, None, None, :]).any(2)
+        bits = 1 << np.arange(k)
+        around = joined @ bits | bits
+        # most points have all of them in one part: what the first is joined to, and so on
+        part, before = around[:, 0], around[:, 0] * 0
+        while (part != before).any():
+            before = part
+            part = np.bitwise_or.reduce(np.where(part[:, None] & bits, around, 0), axis=1)
+        left = (part != (1 << k) - 1).nonzero()[0]
+        if len(left):
+            # Warshall's closure: whoever is joined to j is joined to all that j is joined to
+            closed = around[left]
+            for j in range(k):
+                closed |= np.where(closed >> j & 1, closed[:, j : j + 1], 0)
+            sizes = (closed[:, :, None] >> np.arange(k) & 1).sum(2)
+            part[left] = np.take_along_axis(closed, sizes.argmax(1)[:, None], axis=1)[:, 0]
+        return part[:, None] & bits != 0
 
-    def _place(self, positions: Tensor, nearest: Tensor) -> Tensor:
-        """Where in the table of suspects points are looked up: their pyramids in a grid, else their nearest vertex."""
+    def _mark_uncertified(self, codes: NDArray[np.uint8], positions: NDArray[Any], nearest: NDArray[Any]) -> None:
+        """Sets the codes of points in uncertified cells: by their pyramids in a grid, else by their nearest vertex."""
+        if self._suspect is None:
+            return
+        rows = self._near_suspect[nearest].nonzero()[0]
+        if self._lattice is not None and len(rows):
+            places = self._lattice.pyramids(torch.from_numpy(positions[rows]) - self.low)
+            rows = rows[self._suspect[places].numpy()]
+        codes[rows] = _UNCERTIFIED
+
+    def _near_uncertified(self, roadmap: Roadmap) -> NDArray[np.bool_]:
+        """(R,) resolved vertices that may be nearest to a point in an uncertified cell; without a grid, its corners.
+
+        Such a point lies within the longest edge of a corner of its cell, and its nearest vertex is no farther.
+        """
+        corners = torch.cat([cells.reshape(-1) for cells in roadmap.uncertified]).unique()
         if self._lattice is None:
-            return nearest
-        return self._lattice.pyramids(positions - self.low)
+            return np.isin(self.vertices.numpy(), corners.numpy())
+        places = roadmap.points[corners, : self.task.dimension].numpy()
+        marked = np.zeros(len(self.vertices), dtype=bool)
+        for found in self._tree.query_ball_point(places, 2.0 * self.radius + 1e-9):
+            marked[found] = True
+        return marked
 
     def _uncertified_places(self, roadmap: Roadmap) -> Tensor | None:
-        """(P,) bool by `_place`, the last one false for what is outside; None if every cell is certified."""
+        """(P,) bool by pyramid, the last one false for what is outside; None if every cell is certified.
+
+        Without a grid there are no pyramids, and no entries.
+        """
         cells = [corners for corners in roadmap.uncertified if len(corners)]
         if not cells:
             return None
         if self._lattice is None:
-            suspect = torch.zeros(len(roadmap.points), dtype=torch.bool)
-            for corners in cells:
-                suspect[corners] = True
-            return suspect[self.vertices]
+            return torch.zeros(0, dtype=torch.bool)
         suspect = torch.zeros(2 * len(self._lattice.cells) * math.prod(self._lattice.cells) + 1, dtype=torch.bool)
         for corners in cells:
             suspect[self._lattice.pyramids_at(corners)] = True

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import FEW
+# up to so many columns torch.linalg's own routines are faster
+_FEW = 16
 
 
 def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Tensor:
@@ -18,7 +19,7 @@ def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Te
         error: (m, N).
         damping: (N,) λ > 0.
     """
-    if jacobian.shape[2] <= FEW:
+    if jacobian.shape[2] <= _FEW:
         rows = jacobian.permute(2, 0, 1)
         normal = rows @ rows.mT
         normal.diagonal(dim1=1, dim2=2).add_(damping[:, None])

@@ -13,19 +13,23 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import one_thread, piece, slices
-from grr_torch.projection.step import Equations, Limits, free_step, stop_at_limits
+from grr_torch.pieces import are_few, one_thread, piece, slices
+from grr_torch.projection.few import converge_few
+from grr_torch.projection.step import (
+    DAMPING,
+    FALLEN,
+    LEAST_DAMPING,
+    PATIENCE,
+    ROTATION_LENGTH,
+    Equations,
+    Limits,
+    free_step,
+    stop_at_limits,
+)
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import normalise
 from grr_torch.spaces.task import TaskSpace
 
-# metres that a radian of rotation error counts as
-_ROTATION_LENGTH = 0.3
-# λ = _DAMPING · ½‖e‖² + _LEAST_DAMPING
-_DAMPING = 0.1
-_LEAST_DAMPING = 1e-7
-# a configuration is given up when its error has not fallen by a tenth in so many iterations
-_PATIENCE = 4
 # columns that are done leave a batch, or its piece, when less than so many are left of it
 _LEFT = 0.75
 
@@ -118,8 +122,11 @@ def project_columns(
     """`project` for columns: targets (width, N) and guesses (n, N) give configurations (n, N) and valid (N,)."""
     with torch.no_grad(), one_thread():
         limits = Limits.of(robot)
-        workspace = robot.tree.workspace(q, min(q.shape[1], piece(q.device)))
-        solved, valid = _Projection(robot, task, tolerances, limits, workspace).converge(targets, q)
+        if are_few(q):
+            solved, valid = converge_few(robot, task, tolerances, limits, targets, q)
+        else:
+            workspace = robot.tree.workspace(q, min(q.shape[1], piece(q.device)))
+            solved, valid = _Projection(robot, task, tolerances, limits, workspace).converge(targets, q)
         solved = normalise(solved, robot.continuous[:, None])
         if check_collision and robot.spheres is not None:
             converged = valid.nonzero()[:, 0]
@@ -174,8 +181,8 @@ class _Projection:
         for iteration in range(self.tolerances.iterations + 1):
             last = iteration == self.tolerances.iterations
             done = self._iterate(batch, last)
-            patience = (iteration + 1) % _PATIENCE == 0
-            kept = ~done & (batch.best < 0.81 * batch.before) if patience else ~done
+            patience = (iteration + 1) % PATIENCE == 0
+            kept = ~done & (batch.best < FALLEN * batch.before) if patience else ~done
             left = kept.nonzero()[:, 0]
             if len(left) >= _LEFT * len(done) and not patience and not last:
                 continue
@@ -225,18 +232,18 @@ class _Projection:
         translation, rotation = squared[:rows].sum(0), squared[rows:].sum(0)
         near = translation <= self.tolerances.position**2
         torch.logical_and(near, rotation <= self.tolerances.rotation**2, out=done[part])
-        size = translation.add_(rotation, alpha=_ROTATION_LENGTH**2)
+        size = translation.add_(rotation, alpha=ROTATION_LENGTH**2)
         torch.minimum(batch.best[part], size, out=batch.best[part])
         return frames, error, size
 
     def _equations(self, columns: Tensor, q: Tensor, frames: Tensor, error: Tensor, size: Tensor) -> Equations:
-        """Of a step, a radian counted as `_ROTATION_LENGTH` metres."""
+        """Of a step, a radian counted as `ROTATION_LENGTH` metres."""
         rows = self.task.dimension
         jacobian = self.task.jacobian(self.robot.tree.jacobian(frames))
         if len(error) > rows:
-            error[rows:].mul_(_ROTATION_LENGTH)
-            jacobian[rows:].mul_(_ROTATION_LENGTH)
-        return Equations(columns, q, jacobian, error, size.mul(0.5 * _DAMPING).add_(_LEAST_DAMPING))
+            error[rows:].mul_(ROTATION_LENGTH)
+            jacobian[rows:].mul_(ROTATION_LENGTH)
+        return Equations(columns, q, jacobian, error, size.mul(0.5 * DAMPING).add_(LEAST_DAMPING))
 
     def _step(self, equations: Equations, beyond: list[tuple[Equations, Tensor]], done: Tensor | None = None) -> Tensor:
         """Configurations (n, M) after a step, clamped; those that are done stay.

@@ -11,10 +11,18 @@ from torch import Tensor
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.robots.robot import Robot
 
+# metres that a radian of rotation error counts as
+ROTATION_LENGTH = 0.3
+# λ = DAMPING · ½‖e‖² + LEAST_DAMPING
+DAMPING = 0.1
+LEAST_DAMPING = 1e-7
 # longest step of a joint [rad or m]
-_LONGEST_STEP = 0.5
+LONGEST_STEP = 0.5
 # a step shorter than this [rad or m], with an error left, is one from a stationary point
-_SHORTEST_STEP = 1e-9
+SHORTEST_STEP = 1e-9
+# a configuration is given up when its squared error has not fallen to this share of itself in so many iterations
+PATIENCE = 4
+FALLEN = 0.81
 
 
 class Equations(NamedTuple):
@@ -67,11 +75,11 @@ def free_step(equations: Equations) -> Tensor:
     """Configurations (n, M) after a step that knows no limits."""
     step = damped_least_squares(equations.jacobian, equations.error, equations.damping)
     longest = step.abs().amax(0)
-    stuck = longest < _SHORTEST_STEP
+    stuck = longest < SHORTEST_STEP
     if bool(stuck.any()):
         # at a stationary point, such as a straight arm, any direction may lead on
-        step = torch.where(stuck, _nudge(step), step)
-    return torch.addcmul(equations.q, step, _LONGEST_STEP / longest.clamp_min(_LONGEST_STEP))
+        step = torch.where(stuck, nudge(step), step)
+    return torch.addcmul(equations.q, step, LONGEST_STEP / longest.clamp_min(LONGEST_STEP))
 
 
 def stop_at_limits(limits: Limits, equations: Equations, moved: Tensor) -> Tensor:
@@ -91,7 +99,7 @@ def stop_at_limits(limits: Limits, equations: Equations, moved: Tensor) -> Tenso
         held = torch.where(stopped, kept - q, 0.0)
         rest = error - (jacobian * held).sum(1)
         step = held + damped_least_squares(jacobian * ~stopped, rest, damping)
-        moved = torch.addcmul(q, step, _LONGEST_STEP / step.abs().amax(0).clamp_min(_LONGEST_STEP))
+        moved = torch.addcmul(q, step, LONGEST_STEP / step.abs().amax(0).clamp_min(LONGEST_STEP))
         kept = moved.clamp(*limits)
         beyond = (kept != moved) & ~stopped
         if not bool(beyond.any()):
@@ -100,6 +108,6 @@ def stop_at_limits(limits: Limits, equations: Equations, moved: Tensor) -> Tenso
     return kept
 
 
-def _nudge(step: Tensor) -> Tensor:
+def nudge(step: Tensor) -> Tensor:
     """A small step (n, 1) that moves every joint differently."""
     return 0.05 * torch.cos(torch.arange(1, len(step) + 1, dtype=step.dtype, device=step.device))[:, None]

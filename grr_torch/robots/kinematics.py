@@ -16,7 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import FEW
+from grr_torch.pieces import are_few
+from grr_torch.robots.few_kinematics import FewKinematics
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,8 @@ class KinematicTree:
         """
         if torch.is_grad_enabled() and q.requires_grad:
             return _Frames.apply(q, self)  # type: ignore[no-untyped-call]
-        if q.shape[1] <= FEW:
-            return self._frames_of_few(q)
+        if are_few(q):
+            return torch.from_numpy(self.few.frames(q.detach().numpy()))
         return self._frames_of_many(q, self.workspace(q, q.shape[1]) if workspace is None else workspace)
 
     def workspace(self, like: Tensor, width: int) -> Tensor:
@@ -83,7 +84,7 @@ class KinematicTree:
         What has yet to be turned is put where the next frame comes to lie.
         """
         width, count = q.shape[1], len(self.joints)
-        values = self._joint_values(q, self._joint_matrices[3][:count])
+        values = self._joint_values(q)
         cosines, sine = values.cos().unbind(0), values.sin()
         sines = torch.stack([sine, -sine], 1)[:, :, None].unbind(0)
         frames = workspace[: 12 * (count + 2) * width].view(count + 2, 4, 3, width)
@@ -106,21 +107,6 @@ class KinematicTree:
         torch.mm(mount, whole[index], out=whole[-2])
         return frames
 
-    def _frames_of_few(self, q: Tensor) -> Tensor:
-        """All joints at once: product of each frame with its parent's, then with that product's parent's, and so on.
-
-        64 multiply-adds a frame and round, ⌈log₂ of the depth⌉ rounds; two calls each, whatever the number of joints.
-        """
-        fixed, along_cosine, along_sine, dofs = self._joint_matrices
-        values = self._joint_values(q, dofs).T[..., None, None]
-        sines = values.sin()
-        if self._sliding is not None:
-            sines = torch.where(self._sliding[:, None, None], values, sines)
-        poses = torch.addcmul(torch.addcmul(fixed, along_cosine, values.cos()), along_sine, sines)
-        for parents in self._ancestors:
-            poses = torch.matmul(poses, poses.index_select(1, parents))
-        return poses[..., :3].permute(1, 2, 3, 0)
-
     def tool_pose(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Tool position (3, N) [m] and rotation (3, 3, N): second index counts the tool's axes."""
         axes, position = frames[-2].split_with_sizes((3, 1))
@@ -136,16 +122,14 @@ class KinematicTree:
 
         Column of a revolute joint: (z × (p_tool − p), z); of a prismatic one: (z, 0). 9 multiply-adds a column.
         """
+        if are_few(frames) and not (torch.is_grad_enabled() and frames.requires_grad):
+            return torch.from_numpy(self.few.jacobian(frames.detach().numpy()))
         lines = frames[: self.n] if self._plain_path else frames[list(self.path)]
         axes = lines[:, 2]
-        arms = frames[-2, 3] - lines[:, 3]
-        if frames.shape[3] <= FEW:
-            rows = torch.cat([torch.linalg.cross(axes, arms, dim=1), axes], dim=1).transpose(0, 1)
-        else:
-            # torch's own cross product takes three times as long
-            ax, ay, az = axes.unbind(1)
-            rx, ry, rz = arms.unbind(1)
-            rows = torch.stack([ay * rz - az * ry, az * rx - ax * rz, ax * ry - ay * rx, ax, ay, az])
+        # torch's own cross product takes three times as long
+        ax, ay, az = axes.unbind(1)
+        rx, ry, rz = (frames[-2, 3] - lines[:, 3]).unbind(1)
+        rows = torch.stack([ay * rz - az * ry, az * rx - ax * rz, ax * ry - ay * rx, ax, ay, az])
         if self._plain_path and self._sliding is None:
             return rows
         if self._sliding is not None:
@@ -158,13 +142,13 @@ class KinematicTree:
             drive[self.joints[i].dof, k] = self.joints[i].multiplier
         return torch.einsum("dk,rkN->rdN", drive, rows)
 
-    def _joint_values(self, q: Tensor, dofs: Tensor) -> Tensor:
-        """(F, N) values of frames' joints; those that stand still have any value."""
-        values = q.index_select(0, dofs)
+    def _joint_values(self, q: Tensor) -> Tensor:
+        """(J, N) values of the joints."""
+        values = q.index_select(0, self._dofs)
         if self._mimic is None:
             return values
         multipliers, offsets = self._mimic
-        return values * multipliers[: len(values)] + offsets[: len(values)]
+        return values * multipliers + offsets
 
     def _joint_gradient(self, gradient: Tensor) -> Tensor:
         """(n, N) from (J, N): each entry of q takes what its joints give."""
@@ -201,44 +185,22 @@ class KinematicTree:
 
     @cached_property
     def _mimic(self) -> tuple[Tensor, Tensor] | None:
-        """(F, 1) multipliers and offsets of joint values; None if they are those of q."""
-        figures = [(joint.multiplier, joint.offset) for joint in self.joints] + [(1.0, 0.0)] * 2
+        """(J, 1) multipliers and offsets of joint values; None if they are those of q."""
+        figures = [(joint.multiplier, joint.offset) for joint in self.joints]
         if all(figure == (1.0, 0.0) for figure in figures):
             return None
         multipliers, offsets = self.mounts[0].new_tensor(figures).T[..., None]
         return multipliers, offsets
 
     @cached_property
-    def _joint_matrices(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Constants of `_frames_of_few` by frame: A, B and C (F, 4, 4), and the entry of q that drives it (F,).
-
-        A frame in its parent's is A + cos θ B + sin θ C, rows as in `mounts`; of a sliding joint, the value stands in
-        place of the sine.
-        """
-        fixed, along_cosine, along_sine = (self.mounts[0].new_zeros(len(self.joints) + 2, 4, 4) for _ in range(3))
-        for index, (joint, mount) in enumerate(zip(self.joints, self.mounts, strict=True)):
-            fixed[index] = mount
-            if joint.revolute:
-                fixed[index, :2] = 0.0
-                along_cosine[index, :2] = mount[:2]
-                along_sine[index, :2] = torch.stack([mount[1], -mount[0]])
-            else:
-                along_sine[index, 3] = mount[2]
-        fixed[-2] = self.links[self.tool][1]
-        fixed[-1] = torch.eye(4)
-        dofs = torch.tensor([joint.dof for joint in self.joints] + [0, 0], device=fixed.device)
-        return fixed, along_cosine, along_sine, dofs
+    def few(self) -> FewKinematics:
+        """The same for a few configurations on the CPU."""
+        return FewKinematics(self)
 
     @cached_property
-    def _ancestors(self) -> tuple[Tensor, ...]:
-        """(F,) each: the ancestor 1, 2, 4, … steps up of every frame; the base is its own."""
-        base = len(self.joints) + 1
-        up = [joint.parent % (base + 1) for joint in self.joints] + [self.links[self.tool][0] % (base + 1), base]
-        levels: list[Tensor] = []
-        while any(parent != base for parent in up):
-            levels.append(torch.tensor(up, device=self.mounts[0].device))
-            up = [up[parent] for parent in up]
-        return tuple(levels)
+    def _dofs(self) -> Tensor:
+        """(J,) the entry of q that drives each joint."""
+        return torch.tensor([joint.dof for joint in self.joints], device=self.mounts[0].device)
 
 
 def place(frame: Tensor, points: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import in_pieces, piece
+from grr_torch.pieces import are_few, in_pieces, piece
 from grr_torch.robots.chain import serial_chain
 from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.presets import Preset
@@ -250,6 +250,8 @@ class Robot:
 
     def _of_frames(self, function: Callable[[Tensor], tuple[Tensor, ...]], columns: Tensor) -> tuple[Tensor, ...]:
         """What a function makes of the frames of columns (n, N), a piece at a time."""
+        if are_few(columns):
+            return function(self.tree.frames(columns))
         workspace = self.tree.workspace(columns, min(columns.shape[1], piece(columns.device)))
         return in_pieces(lambda part: function(self.tree.frames(part, workspace)), columns)
 

@@ -117,6 +117,8 @@ class SphereKernel:
         """Whether any checked pair of links is nearer than `margin` [m]: (N,) bool; true where a frame is NaN."""
         near = ~(self._squared(frames, self.bounds) >= (self.bound_reach + margin).square())
         hit = torch.zeros(frames.shape[3], dtype=torch.bool, device=frames.device)
+        if not bool(near.any()):
+            return hit
         for pair, chosen, relative in self._near(frames, near):
             limit = (pair.reach + margin).square()
             for part, squared in pair.squared_distances(relative):

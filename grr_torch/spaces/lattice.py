@@ -7,6 +7,7 @@ import itertools
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,15 +64,17 @@ class Lattice:
         Args:
             offsets: (N, d) points as seen from the grid's first corner [m].
         """
-        cells = torch.tensor(self.cells, device=offsets.device)
-        steps = offsets / offsets.new_tensor(self.spacing)
+        cells = np.array(self.cells)
+        steps = offsets.cpu().numpy() / np.array(self.spacing)
         # what rounding puts outside still counts
         inside = ((steps > -1e-9) & (steps < cells + 1e-9)).all(1)
-        cell = torch.minimum(steps.floor().long().clamp_min(0), cells - 1)
+        cell = np.minimum(np.maximum(steps, 0.0), cells - 1).astype(np.int64)
         from_centre = steps - cell - 0.5
-        axis = from_centre.abs().argmax(1)
-        upper = from_centre.gather(1, axis[:, None])[:, 0] > 0
-        return torch.where(inside, self._pyramid(2 * cell + 1, axis, upper), -1)
+        axis = np.abs(from_centre).argmax(1)
+        upper = np.take_along_axis(from_centre, axis[:, None], axis=1)[:, 0] > 0
+        strides = np.cumprod([1, *self.cells[:0:-1]])[::-1]
+        index = 2 * len(self.cells) * (cell @ strides) + 2 * axis + upper
+        return torch.from_numpy(np.where(inside, index, -1)).to(offsets.device)
 
     def pyramids_at(self, corners: Tensor) -> Tensor:
         """(P,) the pyramids that triangles (C, 3), smallest vertex first, or square faces (C, 4) bound."""

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 # below any sine of an angle that is not 0, and above what a division makes infinite
@@ -89,6 +92,18 @@ def rotation_error(target: Tensor, rotation: Tensor) -> Tensor:
         column = torch.take_along_dim(outer, outer.norm(dim=0).argmax(0)[None, None], dim=1)[:, 0]
         error[:, flipped] = math.pi * column / column.norm(dim=0)
     return error
+
+
+def rotation_error_of_few(target: NDArray[Any], rotation: NDArray[Any]) -> NDArray[Any]:
+    """`rotation_error` for arrays, of one target (3, 3): a third of its time for a few columns."""
+    turn = (target.astype(rotation.dtype) @ rotation.transpose(1, 0, 2).reshape(3, -1)).reshape(9, -1)
+    twisted = 0.5 * (turn[[7, 2, 3]] - turn[[5, 6, 1]])
+    cosine = 0.5 * (turn[0] + turn[4] + turn[8] - 1.0)
+    if (cosine < _HALF_TURN).any():
+        tensors = torch.from_numpy(target).to(torch.from_numpy(rotation))[..., None], torch.from_numpy(rotation)
+        return rotation_error(*tensors).numpy()
+    sine = np.sqrt((twisted * twisted).sum(0)) + _TINY
+    return twisted * (np.arctan2(sine, cosine) / sine)
 
 
 def _product(target: Tensor, rotation: Tensor) -> Tensor:

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from grr_torch.errors import ParameterError, UnknownNameError
@@ -23,8 +25,11 @@ from grr_torch.spaces.rotation import (
     quaternion_distance,
     quaternion_from_matrix,
     rotation_error,
+    rotation_error_of_few,
     slerp,
 )
+
+Array = NDArray[Any]
 
 # weights of translation and rotation in D_p (Section IV-B of the paper)
 TRANSLATION_WEIGHT = 1.0
@@ -117,6 +122,11 @@ class TaskSpace(ABC):
             return translation
         return torch.cat([translation, self.rotation_error(targets, rotation)])
 
+    def error_of_few(self, targets: Array, position: Array, rotation: Array) -> Array:
+        """`error` for arrays: what a space has no faster way for is left to torch."""
+        tensors = (torch.from_numpy(np.ascontiguousarray(array)) for array in (targets, position, rotation))
+        return self.error(*tensors).numpy()
+
     def jacobian(self, jacobian: Tensor) -> Tensor:
         """Rows (constraints, n, N) of a geometric Jacobian (6, n, N) that answer to `error`."""
         rotation_rows = self.constraints - self.dimension
@@ -152,6 +162,10 @@ class Position(TaskSpace):
     def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
         """No rows."""
         return rotation[0, :0]
+
+    def error_of_few(self, targets: Array, position: Array, rotation: Array) -> Array:
+        """`error` for arrays."""
+        return targets - position[: self.dimension]
 
     def to_json(self) -> dict[str, Any]:
         """Kind and dimension."""
@@ -200,6 +214,13 @@ class FixedRotation(TaskSpace):
         if self.dimension == 2:
             return wrap(self.rpy[2] - torch.atan2(rotation[1, 0], rotation[0, 0]))[None]
         return rotation_error(self.rotation.to(rotation)[..., None], rotation)
+
+    def error_of_few(self, targets: Array, position: Array, rotation: Array) -> Array:
+        """`error` for arrays."""
+        if self.dimension == 2:
+            return super().error_of_few(targets, position, rotation)
+        turned = rotation_error_of_few(self.rotation.numpy(), rotation)
+        return np.concatenate([targets - position, turned])
 
     def to_json(self) -> dict[str, Any]:
         """Kind, dimension and angles."""
