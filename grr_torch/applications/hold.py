@@ -30,7 +30,7 @@ _ITERATIONS = 5
 _NEARER = 0.8
 
 
-def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """One step of a search for the solvable point nearest to each target.
 
     Points round the last one found are solved, towards the target and across. The nearest to the target is taken if the
@@ -44,40 +44,45 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
         targets: (B, width) targets.
 
     Returns:
-        Points (B, width) and configurations (B, n).
+        Points (B, width), configurations (B, n), and which targets the map solves (B,).
     """
-    count, width = base.shape
+    count = len(base)
     apart = (targets - base).norm(dim=1).clamp_max(_AROUND)
     directions = apart[:, None, None] * _directions(targets - base)
     steps = torch.cat([share * directions for share in _SHARES], dim=1)
-    points = torch.cat([base[:, None], base[:, None] + steps], dim=1)
-    flat = points.reshape(-1, width)
-    guesses, codes = solver.guess(flat.cpu())
+    points = torch.cat([base[:, None], base[:, None] + steps, targets[:, None]], dim=1)
+    # as long as the arm can stay where it is, only what is nearer to the target can be better
+    known = base_q.isfinite().all(1)
+    left = (points - targets[:, None]).norm(dim=2)
+    tried = (left < left[:, :1]) | ~known[:, None]
+    tried[:, [0, -1]] = True
+    flat = points[tried]
+    guesses, codes = solver.guess(flat)
     columns, codes = solver.solve_from(
         flat.T.contiguous(), guesses, codes, replace(solver.tolerances, iterations=_ITERATIONS)
     )
-    q = columns.T.reshape(count, points.shape[1], -1)
+    q = points.new_full((*points.shape[:2], solver.robot.n), torch.nan)
+    q[tried] = columns.T
+    fits, solved = torch.zeros_like(tried), torch.zeros_like(tried)
+    solved[tried] = codes <= 1
     # near full stretch, much joint motion brings little
-    fits = (codes <= 1).to(q.device).reshape(count, -1)
-    fits &= distance(q, guesses.to(q).reshape(q.shape), solver.robot.continuous) <= _STRETCHED
-    known = base_q.isfinite().all(1)
+    fits[tried] = solved[tried] & (distance(columns.T, guesses, solver.robot.continuous) <= _STRETCHED)
     reach = _SLOPE * (points - base[:, None]).norm(dim=2) + _LEAST
     moved = torch.where(known[:, None], distance(q, base_q[:, None].nan_to_num(), solver.robot.continuous), 0.0)
     fits &= moved <= reach
-    score = torch.where(fits, (points - targets[:, None]).norm(dim=2) + _WORTH * moved, torch.inf)
+    score = torch.where(fits, left + _WORTH * moved, torch.inf)
     best = score.argmin(1)
     rows = torch.arange(count, device=base.device)
     found, found_q = points[rows, best], q[rows, best]
     # a point that the map no longer solves is better than none
     kept = ~score[rows, best].isfinite() & known
     found, found_q = torch.where(kept[:, None], base, found), torch.where(kept[:, None], base_q, found_q)
-    distances, vertices = solver.nearest(targets.cpu())
-    lost = ~found_q.isfinite().all(1).cpu()
-    over = lost | (distances[:, 0] < _NEARER * (found - targets).norm(dim=1).cpu())
-    return (
-        torch.where(over[:, None].to(q.device), solver.points[vertices[:, 0]].to(q), found),
-        torch.where(over[:, None].to(q.device), solver.configurations[vertices[:, 0]].to(q), found_q),
-    )
+    distances, vertices = solver.nearest(targets)
+    lost = ~found_q.isfinite().all(1)
+    over = lost | (distances[:, 0] < _NEARER * (found - targets).norm(dim=1))
+    found = torch.where(over[:, None], solver.points[vertices[:, 0]], found)
+    found_q = torch.where(over[:, None], solver.configurations[vertices[:, 0]], found_q)
+    return found, found_q, solved[:, -1]
 
 
 def _directions(towards: Tensor) -> Tensor:

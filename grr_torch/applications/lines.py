@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from grr_torch.projection.continuity import continuous_columns
@@ -149,10 +150,13 @@ class Follower:
         chain = np.concatenate([q[:, None], way, ends[:, None]], axis=1)
         gaps = _norm(self._difference(chain[:, :-1], chain[:, 1:]))
         wide = ~(gaps < self.epsilon)
-        hit = self._hits(chain[:, 1:], q, steps)
-        safe = np.where(near, reached[:, -1], reached[:, -2]) & ~hit[:, parts:].any(1)
-        direct = short & safe & reached[:, : parts - 1].all(1) & reached[:, -1] & ~hit[:, :parts].any(1)
-        direct &= (gaps < np.where(length <= _BRIDGED, _WIDEST, 1.0)[:, None] * self.epsilon).all(1)
+        stepped = np.where(near, reached[:, -1], reached[:, -2])
+        whole = short & stepped & reached[:, : parts - 1].all(1) & reached[:, -1]
+        whole &= (gaps < np.where(length <= _BRIDGED, _WIDEST, 1.0)[:, None] * self.epsilon).all(1)
+        asked = np.concatenate([np.repeat(whole[:, None], parts - 1, 1), reached[:, -1:], stepped[:, None]], axis=1)
+        hit = self._hits(chain[:, 1:], q, steps, asked)
+        safe = stepped & ~hit[:, parts:].any(1)
+        direct = whole & safe & ~hit[:, :parts].any(1)
         bridged = direct[:, None] & wide
         if bridged.any():
             stops = torch.arange(parts + 1, dtype=p.dtype) / parts
@@ -187,13 +191,19 @@ class Follower:
         per_turn, turn = self._turns
         return motion - turn * np.round(motion * per_turn)
 
-    def _hits(self, alone: Array, q: Array, ends: Array) -> Array:
-        """Self-collisions (B, K + S) of configurations (B, K, n) and of those between `q` and `ends` (B, n)."""
+    def _hits(self, alone: Array, q: Array, ends: Array, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Self-collisions (B, K + S) of configurations (B, K, n) and of those between `q` and `ends` (B, n).
+
+        What is not asked for, by `asked` (B, K + 1), counts as one; its last column is for all between `q` and `ends`.
+        """
         fractions = (np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS).astype(q.dtype)
         between = q[:, None] + fractions * (ends - q)[:, None]
-        all_ = np.concatenate([alone, between], axis=1)
-        columns = np.ascontiguousarray(all_.reshape(-1, all_.shape[2]).T)
-        return self.robot.columns_in_self_collision(torch.from_numpy(columns)).numpy().reshape(all_.shape[:2])
+        every = np.concatenate([alone, between], axis=1)
+        asked = np.concatenate([asked[:, :-1], np.repeat(asked[:, -1:], SUBSTEPS, 1)], axis=1)
+        hit = np.ones(every.shape[:2], dtype=bool)
+        columns = torch.from_numpy(np.ascontiguousarray(every[asked].T))
+        hit[asked] = self.robot.columns_in_self_collision(columns).numpy()
+        return hit
 
     @cached_property
     def _longest(self) -> Array:

@@ -64,6 +64,7 @@ class Arms:
         last_vertex: (B,) the last vertex of a route, and
         last_goal: (B, width) the goal it belongs to; NaN where there is none.
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
+        looked: (B,) arms on a route that looked for a straight way to their target in the last step.
     """
 
     q: Tensor
@@ -75,6 +76,7 @@ class Arms:
     last_vertex: Tensor
     last_goal: Tensor
     next_vertex: Tensor
+    looked: Tensor
 
     @staticmethod
     def at(follower: Follower, q: Tensor) -> Arms:
@@ -82,7 +84,8 @@ class Arms:
         nothing = q.new_full((len(q), follower.task.width), torch.nan)
         off, no_vertex = torch.zeros(len(q), dtype=torch.bool), torch.full((len(q),), -1)
         held, last_goal = nothing.clone(), nothing.clone()
-        arms = Arms(q, torch.zeros_like(q), nothing, off, held, q * torch.nan, no_vertex.clone(), last_goal, no_vertex)
+        routes = no_vertex.clone(), last_goal, no_vertex, off.clone()
+        arms = Arms(q, torch.zeros_like(q), nothing, off, held, q * torch.nan, *routes)
         arms.look(follower, torch.arange(len(q)))
         return arms
 
@@ -99,6 +102,7 @@ class Arms:
         """Arms (A,) that have no more need of a route or a point to hold at."""
         self.held[which] = self.held_q[which] = torch.nan
         self.next_vertex[which] = -1
+        self.looked[which] = False
 
 
 class Pilot:
@@ -108,34 +112,78 @@ class Pilot:
         self.follower, self.solver, self.routes = follower, solver, routes
 
     def steps(self, arms: Arms, which: Tensor, targets: Tensor) -> Steps:
-        """The next step of some arms (A,) that are given targets (A, width)."""
-        guesses, codes = self.solver.guess(targets.cpu())
-        known = (codes <= 1).to(targets.device)
-        q, p, guesses = arms.q[which], arms.p[which], guesses.to(targets)
-        lines = self.follower.follow(q, p, torch.where(known[:, None], guesses, q), targets)
-        valid = known & lines.converged & ~lines.collides & self.solver.on_map(lines.ends, guesses)
-        direct = valid & lines.direct & arms.on_task[which]
-        steps = Steps(lines.steps, lines.ends, lines.points, torch.full((len(which),), TRACKING))
+        """The next step of some arms (A,) that are given targets (A, width).
+
+        On a route, every other step only follows it, so that no step takes long.
+        """
+        unknown = torch.full_like(targets, torch.nan)
+        nowhere = torch.full_like(arms.q[which], torch.nan)
+        steps = Steps(arms.q[which], nowhere, unknown, torch.full((len(which),), DETOURING))
+        left = torch.ones(len(which), dtype=torch.bool)
+        on_way = (arms.looked[which] & (arms.next_vertex[which] >= 0) & arms.on_task[which]).nonzero()[:, 0]
+        if len(on_way):
+            arms.looked[which[on_way]] = False
+            steps.q[on_way], left[on_way] = self._route(arms, which[on_way])
+        rest = left.nonzero()[:, 0]
+        if len(rest) == len(which):
+            return self._look(arms, which, targets)
+        if len(rest):
+            for part, other in zip(steps, self._look(arms, which[rest], targets[rest]), strict=True):
+                part[rest] = other
+        return steps
+
+    def _look(self, arms: Arms, which: Tensor, targets: Tensor) -> Steps:
+        """`steps` of arms that look where they can go."""
+        # who waits for a target to become feasible looks for a nearer point to hold at, and at the target with it
+        lost = arms.held[which].isfinite().all(1)
+        if bool(lost.any()):
+            lost[lost.clone()] = ~self._hold(arms, which[lost], targets[lost])
+        q, p = arms.q[which], arms.p[which]
+        direct, valid = torch.zeros_like(lost), torch.zeros_like(lost)
+        steps = Steps(q, torch.full_like(q, torch.nan), p, torch.full((len(which),), TRACKING))
+        rows = (~lost).nonzero()[:, 0]
+        if len(rows):
+            guesses, codes = self.solver.guess(targets[rows])
+            rows, guesses = rows[codes <= 1], guesses[codes <= 1]
+        if len(rows):
+            lines = self.follower.follow(q[rows], p[rows], guesses, targets[rows])
+            valid[rows] = lines.converged & ~lines.collides & self.solver.on_map(lines.ends, guesses)
+            direct[rows] = valid[rows] & lines.direct & arms.on_task[which[rows]]
+            steps.q[rows], steps.goals[rows], steps.points[rows] = lines.steps, lines.ends, lines.points
         if bool(direct.all()):
             arms.forget(which)
             return steps
         arms.forget(which[direct])
+        fresh = (~valid & ~lost).nonzero()[:, 0]
+        if len(fresh):
+            self._hold(arms, which[fresh], targets[fresh])
         rest = (~direct).nonzero()[:, 0]
-        others = self._indirect(arms, which[rest], targets[rest], valid[rest], lines.ends[rest])
+        others = self._indirect(arms, which[rest], targets[rest], valid[rest], steps.goals[rest])
         for part, other in zip(steps, others, strict=True):
             part[rest] = other
         return steps
 
+    def _hold(self, arms: Arms, which: Tensor, targets: Tensor) -> Tensor:
+        """Looks for the nearest points to targets (A, width) that arms can hold at; which targets are solvable (A,)."""
+        unset = arms.held[which].isnan().any(1)
+        base = torch.where(unset[:, None], arms.p[which], arms.held[which])
+        arms.held[which], arms.held_q[which], solved = nearest_feasible(self.solver, base, arms.held_q[which], targets)
+        return solved
+
     def _indirect(self, arms: Arms, which: Tensor, targets: Tensor, valid: Tensor, ends: Tensor) -> Steps:
-        """`steps` of arms that cannot go straight to their targets; `ends` are configurations where `valid`."""
+        """`steps` of arms that cannot go straight to their targets.
+
+        Those that have a configuration there (`ends`, where `valid`) are on the way to it, others to where they hold.
+        """
         goals, goals_q = targets.clone(), ends.clone()
         unknown = torch.full_like(goals, torch.nan)
         codes = torch.full((len(which),), DETOURING)
         steps = Steps(arms.q[which].clone(), torch.full_like(ends, torch.nan), unknown, codes)
         left = torch.ones_like(valid)
+        arms.held[which[valid]] = arms.held_q[which[valid]] = torch.nan
         lost = (~valid).nonzero()[:, 0]
         if len(lost):
-            goals[lost], goals_q[lost] = self._hold(arms, which[lost], targets[lost])
+            goals[lost], goals_q[lost] = arms.held[which[lost]], arms.held_q[which[lost]]
             lines = self.follower.follow(arms.q[which[lost]], arms.p[which[lost]], goals_q[lost], goals[lost])
             straight = lines.direct & arms.on_task[which[lost]]
             rows = lost[straight]
@@ -146,7 +194,9 @@ class Pilot:
             steps.codes[rows], left[rows] = UNREACHABLE, False
         routed = (left & arms.on_task[which]).nonzero()[:, 0]
         if len(routed):
-            steps.q[routed], left[routed] = self._route(arms, which[routed], goals[routed], goals_q[routed])
+            self._set_goals(arms, which[routed], goals[routed], goals_q[routed])
+            steps.q[routed], left[routed] = self._route(arms, which[routed], looked=True)
+            arms.looked[which[routed]] = True
         for row in left.nonzero()[:, 0].tolist():
             step = self._back(arms, int(which[row]), goals_q[row])
             if step is None:
@@ -155,31 +205,32 @@ class Pilot:
                 steps.q[row] = step
         return steps
 
-    def _hold(self, arms: Arms, which: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-        """The nearest points to targets (A, width) that arms can go to, with configurations; the arms keep them."""
-        unset = arms.held[which].isnan().any(1)
-        base = torch.where(unset[:, None], arms.p[which], arms.held[which])
-        arms.held[which], arms.held_q[which] = nearest_feasible(self.solver, base, arms.held_q[which], targets)
-        return arms.held[which], arms.held_q[which]
-
-    def _route(self, arms: Arms, which: Tensor, goals: Tensor, goals_q: Tensor) -> tuple[Tensor, Tensor]:
-        """Steps (A, n) of arms on shortest paths to goals, and which found no way (A,)."""
-        result, left = arms.q[which].clone(), torch.ones(len(which), dtype=torch.bool)
+    def _set_goals(self, arms: Arms, which: Tensor, goals: Tensor, goals_q: Tensor) -> None:
+        """Looks for the last vertices of arms' routes again, where the goals (A, width) have moved."""
         moved = ~((goals - arms.last_goal[which]).norm(dim=1) <= _SAME_GOAL)
         if bool(moved.any()):
             arms.last_goal[which[moved]] = goals[moved]
             arms.last_vertex[which[moved]] = torch.tensor(self._last_vertices(goals[moved], goals_q[moved]))
+
+    def _route(self, arms: Arms, which: Tensor, looked: bool = False) -> tuple[Tensor, Tensor]:
+        """Steps (A, n) of arms on shortest paths to their last vertices, and which found no way (A,).
+
+        Arms that have `looked` round in this step go on to the next vertex; others try to leave some out.
+        """
+        result, left = arms.q[which].clone(), torch.ones(len(which), dtype=torch.bool)
         ends = arms.last_vertex[which].tolist()
         for fresh in (False, True):
             # where the next vertex of a route cannot be gone to any more, a new way in is looked for
             rows = (left & ((arms.next_vertex[which] >= 0) | fresh)).nonzero()[:, 0].tolist()
-            entries = self.solver.nearest(arms.p[which].cpu(), _ENTRIES)[1] if fresh and rows else None
+            entries = self.solver.nearest(arms.p[which], _ENTRIES)[1] if fresh and rows else None
             tried: list[tuple[int, int, float, bool]] = []
             for row in rows:
                 cost, following = self.routes.towards(ends[row])
                 current = int(arms.next_vertex[which[row]])
                 ahead = _ahead(current, following) if entries is None else entries[row].tolist()
                 on_edge = 0 if fresh else 1 + self._arrived(arms, int(which[row]))
+                if looked and not fresh:
+                    ahead = ahead[:on_edge]
                 tried += [(row, v, float(cost[v]), k < on_edge) for k, v in enumerate(ahead) if cost[v] < float("inf")]
             if tried:
                 self._enter(arms, which, result, left, tried)
@@ -205,7 +256,7 @@ class Pilot:
         """
         owner, vertex = torch.tensor([item[0] for item in tried]), torch.tensor([item[1] for item in tried])
         q, p = arms.q[which[owner]], arms.p[which[owner]]
-        placed, points = self.solver.configurations[vertex].to(q), self.solver.points[vertex].to(q)
+        placed, points = self.solver.configurations[vertex], self.solver.points[vertex]
         lines = self.follower.follow(q, p, placed, points)
         passable = lines.direct | (lines.safe & torch.tensor([item[3] for item in tried]))
         total = q.new_tensor([item[2] for item in tried]) + distance(q, placed, self.follower.robot.continuous)
@@ -223,7 +274,7 @@ class Pilot:
 
         Of all of them, where there is no such line.
         """
-        vertices = self.solver.nearest(goals.cpu(), _ENDS)[1]
+        vertices = self.solver.nearest(goals, _ENDS)[1]
         placed = self.solver.configurations[vertices].to(goals_q)
         apart = distance(placed, goals_q[:, None], self.follower.robot.continuous)
         count = vertices.shape[1]
@@ -234,12 +285,12 @@ class Pilot:
             self.solver.points[vertices].to(goals).reshape(-1, goals.shape[1]),
         )
         apart += torch.where(lines.direct.reshape(apart.shape), 0.0, _NOT_JOINED)
-        return vertices.gather(1, apart.cpu().argmin(1)[:, None])[:, 0].tolist()
+        return vertices.gather(1, apart.argmin(1)[:, None])[:, 0].tolist()
 
     def _back(self, arms: Arms, arm: int, goal_q: Tensor) -> Tensor | None:
         """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near."""
         arms.next_vertex[arm] = -1
-        vertices = self.solver.nearest(arms.p[arm][None].cpu(), _WAYS_BACK)[1][0]
+        vertices = self.solver.nearest(arms.p[arm][None], _WAYS_BACK)[1][0]
         ends = self.solver.configurations[vertices].to(goal_q)
         here = self.solver.solve_columns(arms.p[arm][:, None])[0].T
         if not bool(distance(here, arms.q[arm], self.follower.robot.continuous) <= _ON_MAP):
