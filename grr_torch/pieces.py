@@ -12,7 +12,7 @@ from torch import Tensor
 _ON_CPU = 3500
 _ON_GPU = 1 << 18
 # up to so many, on the CPU, the number of calls is the cost, not the arithmetic
-FEW = 100
+FEW = 300
 
 
 def piece(device: torch.device) -> int:
