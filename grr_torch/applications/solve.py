@@ -31,6 +31,8 @@ _SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_C
 _AT_ONCE = 1 << 12
 # a guess averages over so many vertices, in the plane and in space: a grid's first two shells
 _NEIGHBOURS = {2: 8, 3: 14}
+# of so many points the neighbours are searched for on all processors
+_MANY = 1000
 # the most vertices of which a matrix of neighbours is made: 16 MiB
 _MATRIX = 4096
 # no vertex farther than so many of the longest edges counts, and one must lie within one of them
@@ -147,7 +149,7 @@ class Solver:
         positions = points[:, : self.task.dimension].numpy()
         k = min(_NEIGHBOURS[self.task.dimension], len(self.vertices))
         # the one after the k-th is at infinity where there is none
-        distances, nearest = self._tree.query(positions, k + 1)
+        distances, nearest = self._tree.query(positions, k + 1, workers=-1 if len(points) > _MANY else 1)
         near, nearest = np.maximum(distances[:, :k], 1e-12), nearest[:, :k]
         if math.isfinite(self.radius):
             reach = np.minimum(distances[:, k:], _FARTHEST * self.radius)
@@ -195,7 +197,7 @@ class Solver:
         """
         k = nearest.shape[1]
         if self._joined is not None:
-            joined = self._joined[nearest[:, :, None], nearest[:, None, :]]
+            joined = self._joined.take(nearest[:, :, None] * len(self.vertices) + nearest[:, None, :])
         else:
             joined = (self._ends[nearest][..., None] == nearest[:, None, None, :]).any(2)
         bits = 1 << np.arange(k)
