@@ -97,7 +97,7 @@ class Follower:
         """ε of the continuity check: 0.05 √n [rad]."""
         return 0.05 * math.sqrt(self.robot.n)
 
-    def follow(self, q: Tensor, p: Tensor, guesses: Tensor, targets: Tensor) -> Lines:
+    def follow(self, q: Tensor, p: Tensor, guesses: Tensor, targets: Tensor, offsets: Tensor | None = None) -> Lines:
         """Follows lines, all their points at once.
 
         It asks what the recursion of IsContinuous asks where it ends: points on the line whose configurations are
@@ -109,10 +109,13 @@ class Follower:
             p: (B, width) the points where their tools are.
             guesses: (B, n) guesses for the lines' ends.
             targets: (B, width) the ends.
+            offsets: (B, n) what the ends are expected to differ from their guesses by, as they did in the last step:
+                lines lead there, so that steps are not short where guesses are far off. By default nothing.
         """
         standing, wanted = q.numpy(), targets.numpy()
         count = len(standing)
-        motion = self._difference(standing, guesses.numpy())
+        aims = guesses if offsets is None else guesses + offsets
+        motion = self._difference(standing, aims.numpy())
         share = _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
         near = share >= _SLACK
         length = _norm(motion)
@@ -130,6 +133,8 @@ class Follower:
         places = torch.from_numpy(p.numpy()[rows]), torch.from_numpy(wanted[rows])
         on_way = self.task.interpolate(*places, torch.from_numpy(fraction))
         starts = standing[rows] + fraction * motion[rows]
+        if offsets is not None:
+            starts[np.cumsum(looked.sum(1)) - 1] = guesses.numpy()
         solved, valid = project_columns(
             self.robot, self.task, on_way.T, torch.from_numpy(starts.T), self.tolerances, check_collision=False
         )

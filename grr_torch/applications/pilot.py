@@ -14,7 +14,7 @@ from grr_torch.applications.lines import Follower
 from grr_torch.applications.rejoin import rejoin
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
-from grr_torch.spaces.configuration import distance
+from grr_torch.spaces.configuration import difference, distance
 
 TRACKING, DETOURING, HOLDING, UNREACHABLE = range(4)
 
@@ -24,6 +24,10 @@ _ENDS = 8
 _WAYS_BACK = 32
 # metres that a goal moves before the last vertex of the route to it is looked for again
 _SAME_GOAL = 0.03
+# the most steps for which an arm on a route does not look for a straight way
+_MOST_DOUBT = 32
+# the most that a guess is expected to be off by [rad]
+_OFFSET = 0.3
 # more than any distance of configurations [rad]
 _NOT_JOINED = 1e3
 # an arm so near [rad or m] to a vertex's configuration is at the vertex
@@ -64,7 +68,9 @@ class Arms:
         last_vertex: (B,) the last vertex of a route, and
         last_goal: (B, width) the goal it belongs to; NaN where there is none.
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
-        looked: (B,) arms on a route that looked for a straight way to their target in the last step.
+        blind: (B,) steps for which an arm on a route follows it before it looks for a straight way to its target again.
+        doubt: (B,) how many these are the next time.
+        offsets: (B, n) what the last end of a line differed from its guess by.
     """
 
     q: Tensor
@@ -76,7 +82,9 @@ class Arms:
     last_vertex: Tensor
     last_goal: Tensor
     next_vertex: Tensor
-    looked: Tensor
+    blind: Tensor
+    doubt: Tensor
+    offsets: Tensor
 
     @staticmethod
     def at(follower: Follower, q: Tensor) -> Arms:
@@ -84,8 +92,9 @@ class Arms:
         nothing = q.new_full((len(q), follower.task.width), torch.nan)
         off, no_vertex = torch.zeros(len(q), dtype=torch.bool), torch.full((len(q),), -1)
         held, last_goal = nothing.clone(), nothing.clone()
-        routes = no_vertex.clone(), last_goal, no_vertex, off.clone()
-        arms = Arms(q, torch.zeros_like(q), nothing, off, held, q * torch.nan, *routes)
+        routes = no_vertex.clone(), last_goal, no_vertex, torch.zeros_like(no_vertex), torch.ones_like(no_vertex)
+        still = torch.zeros_like(q)
+        arms = Arms(q, still, nothing, off, held, q * torch.nan, *routes, still.clone())
         arms.look(follower, torch.arange(len(q)))
         return arms
 
@@ -102,7 +111,7 @@ class Arms:
         """Arms (A,) that have no more need of a route or a point to hold at."""
         self.held[which] = self.held_q[which] = torch.nan
         self.next_vertex[which] = -1
-        self.looked[which] = False
+        self.blind[which] = 0
 
 
 class Pilot:
@@ -114,15 +123,15 @@ class Pilot:
     def steps(self, arms: Arms, which: Tensor, targets: Tensor) -> Steps:
         """The next step of some arms (A,) that are given targets (A, width).
 
-        On a route, every other step only follows it, so that no step takes long.
+        On a route, steps that look for a straight way take turns with such that only follow it: none takes long.
         """
         unknown = torch.full_like(targets, torch.nan)
         nowhere = torch.full_like(arms.q[which], torch.nan)
         steps = Steps(arms.q[which], nowhere, unknown, torch.full((len(which),), DETOURING))
         left = torch.ones(len(which), dtype=torch.bool)
-        on_way = (arms.looked[which] & (arms.next_vertex[which] >= 0) & arms.on_task[which]).nonzero()[:, 0]
+        on_way = ((arms.blind[which] > 0) & (arms.next_vertex[which] >= 0) & arms.on_task[which]).nonzero()[:, 0]
         if len(on_way):
-            arms.looked[which[on_way]] = False
+            arms.blind[which[on_way]] -= 1
             steps.q[on_way], left[on_way] = self._route(arms, which[on_way])
         rest = left.nonzero()[:, 0]
         if len(rest) == len(which):
@@ -146,7 +155,10 @@ class Pilot:
             guesses, codes = self.solver.guess(targets[rows])
             rows, guesses = rows[codes <= 1], guesses[codes <= 1]
         if len(rows):
-            lines = self.follower.follow(q[rows], p[rows], guesses, targets[rows])
+            lines = self.follower.follow(q[rows], p[rows], guesses, targets[rows], arms.offsets[which[rows]])
+            offsets = difference(guesses, lines.ends, self.follower.robot.continuous)
+            fits = offsets.norm(dim=1) <= _OFFSET
+            arms.offsets[which[rows]] = torch.where((lines.converged & fits)[:, None], offsets, 0.0)
             valid[rows] = lines.converged & ~lines.collides & self.solver.on_map(lines.ends, guesses)
             direct[rows] = valid[rows] & lines.direct & arms.on_task[which[rows]]
             steps.q[rows], steps.goals[rows], steps.points[rows] = lines.steps, lines.ends, lines.points
@@ -196,7 +208,7 @@ class Pilot:
         if len(routed):
             self._set_goals(arms, which[routed], goals[routed], goals_q[routed])
             steps.q[routed], left[routed] = self._route(arms, which[routed], looked=True)
-            arms.looked[which[routed]] = True
+            arms.blind[which[routed]] = arms.doubt[which[routed]]
         for row in left.nonzero()[:, 0].tolist():
             step = self._back(arms, int(which[row]), goals_q[row])
             if step is None:
@@ -208,6 +220,10 @@ class Pilot:
     def _set_goals(self, arms: Arms, which: Tensor, goals: Tensor, goals_q: Tensor) -> None:
         """Looks for the last vertices of arms' routes again, where the goals (A, width) have moved."""
         moved = ~((goals - arms.last_goal[which]).norm(dim=1) <= _SAME_GOAL)
+        # whose straight way to the same goal came to nothing trusts the next one later, lest it goes to and fro
+        again = arms.next_vertex[which] < 0
+        longer = torch.where(again, 2 * arms.doubt[which], arms.doubt[which]).clamp_max(_MOST_DOUBT)
+        arms.doubt[which] = torch.where(moved, 1, longer)
         if bool(moved.any()):
             arms.last_goal[which[moved]] = goals[moved]
             arms.last_vertex[which[moved]] = torch.tensor(self._last_vertices(goals[moved], goals_q[moved]))
