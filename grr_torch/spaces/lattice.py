@@ -66,7 +66,7 @@ class Lattice:
         cells = torch.tensor(self.cells, device=offsets.device)
         steps = offsets / offsets.new_tensor(self.spacing)
         # what rounding puts outside still counts
-        inside = ((steps > -1e-9) & (steps < cells + 1e-9)).all(1)
+        inside = ((steps > -1e-9) & (steps - cells < 1e-9)).all(1)
         cell = torch.minimum(steps.floor().long().clamp_min(0), cells - 1)
         from_centre = steps - cell - 0.5
         axis = from_centre.abs().argmax(1)
