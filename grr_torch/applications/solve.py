@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
 # what a status says; the first two are those of valid configurations
-STATUSES = ("solved", "uncertified", "outside", "too far", "not converged", "off the map", "self-collision")
-_SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_COLLISION = range(len(STATUSES))
+STATUSES = ("solved", "uncertified", "outside", "too far", "not converged", "off the map", "self-collision", "no cell")
+_SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_COLLISION, _ = range(len(STATUSES))
 
 # points worked on together
 _AT_ONCE = 1 << 12
@@ -51,7 +51,8 @@ class Solution:
         status: (*batch,) array of text. Of valid ones: "solved", or "uncertified" in a cell inside which the map may
             not be continuous. Of others: "outside" the roadmap's bounds, "too far" from every resolved vertex, "not
             converged", "off the map", where the projection ends in another posture than the vertices around have, or
-            in "self-collision".
+            in "self-collision"; and of the differentiable map, "no cell" where a corner of the cell is not resolved or
+            an edge of it is broken.
     """
 
     configurations: Tensor

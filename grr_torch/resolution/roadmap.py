@@ -20,6 +20,7 @@ from grr_torch.spaces.task import TaskSpace
 if TYPE_CHECKING:
     import networkx
 
+    from grr_torch.applications.differentiable import DifferentiableSolver
     from grr_torch.applications.path import Path
     from grr_torch.applications.solve import Solution, Solver
 
@@ -105,24 +106,41 @@ class Roadmap:
 
         return Solver(self)
 
-    def solve(self, points: Tensor, *, progress: Progress = silent) -> Solution:
+    @cached_property
+    def differentiable_solver(self) -> DifferentiableSolver:
+        """Tables for differentiable `solve`, made when they are first needed."""
+        from grr_torch.applications.differentiable import DifferentiableSolver
+
+        return DifferentiableSolver(self)
+
+    def solve(self, points: Tensor, *, differentiable: bool = False, progress: Progress = silent) -> Solution:
         """The map as an IK solver: one configuration for any points of the task space (Section IV-E of the paper).
 
         Each point's guess is the weighted, circular average over its nearest resolved vertices, of which only those in
         the largest part that edges of the map connect count. It is projected onto the point as in building, with the
         same limits and self-collision.
 
+        With `differentiable`, the map is a function of its own, a little beside the other one: the configuration at the
+        point that is nearest to the average over the corners of the point's cell (in the plane a triangle of the grid,
+        in space the pyramid of a cell's centre and face) by their barycentric weights, polished to 1e-10. It is smooth
+        inside a cell, and its gradients come from the implicit function theorem. It has no jump where cells meet whose
+        edges are connected, but its derivative has. A joint whose limit is in the way is held there; where that begins,
+        the derivative jumps too. Only whole, certified cells are "solved" here; where a corner is missing or an edge
+        broken, valid points are "uncertified". Points that are not valid get no gradient: leave them out of a loss.
+
         Args:
             points: (*batch, width) points [m]; one or a million.
+            differentiable: Whether gradients flow from configurations to points, once.
             progress: Told how many are solved.
 
         Returns:
             Configurations, which of them are valid, and a status that says why not.
 
         Raises:
-            ParameterError: The width is not the task's, a value is not finite, or no vertex is resolved.
+            ParameterError: The width is not the task's, a value is not finite, or no vertex is resolved. To
+                differentiate: the rotation varies, the points are no staggered grid, or the robot is not in float64.
         """
-        return self.solver(points, progress=progress)
+        return (self.differentiable_solver if differentiable else self.solver)(points, progress=progress)
 
     def plan(
         self,

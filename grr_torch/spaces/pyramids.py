@@ -1,0 +1,69 @@
+"""The pyramids of a staggered grid: their corners, and weights of these that are continuous over the whole grid.
+
+A pyramid is a cell's centre over one of its faces, in the plane the triangle of a centre and an edge. Its index is
+that of `Lattice.pyramids`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from torch import Tensor
+
+from grr_torch.spaces.lattice import Lattice
+
+# of a half cell: below this distance from a centre, directions do not count
+_AT_CENTRE = 1e-12
+
+
+def pyramid_corners(lattice: Lattice) -> Tensor:
+    """(P, K) vertices of all pyramids: the corners of the face, the last axis fastest, and behind them the centre.
+
+    K is 3 in the plane and 5 in space.
+    """
+    d = len(lattice.cells)
+    corner = torch.arange(math.prod(count + 1 for count in lattice.cells))
+    corner = corner.reshape([count + 1 for count in lattice.cells])
+    centre = len(corner.flatten()) + torch.arange(math.prod(lattice.cells))
+    pyramids: list[Tensor] = []
+    for axis, upper in itertools.product(range(d), (0, 1)):
+        face: list[Tensor] = []
+        for shift in itertools.product((0, 1), repeat=d - 1):
+            shifts = (*shift[:axis], upper, *shift[axis:])
+            window = tuple(slice(s, s + count) for s, count in zip(shifts, lattice.cells, strict=True))
+            face.append(corner[window].flatten())
+        pyramids.append(torch.stack([*face, centre], dim=1))
+    return torch.stack(pyramids, dim=1).flatten(0, 1)
+
+
+def pyramid_weights(lattice: Lattice, offsets: Tensor, pyramids: Tensor) -> Tensor:
+    """Barycentric weights (N, K) of the corners of the pyramids that points lie in. Differentiable.
+
+    They are not negative, add up to 1, and give back the point. On a face only the weights of its own corners are not
+    zero, and they are the same from both sides. In space a height t ∈ [0, 1] above the centre has
+    the centre's weight 1 − t, and the square face the rest, bilinearly: there are five corners, so that other weights
+    would do too, but not all would be continuous.
+
+    Args:
+        lattice: The grid.
+        offsets: (N, d) points as seen from the grid's first corner [m].
+        pyramids: (N,) where they lie, from `Lattice.pyramids`; none of them −1.
+    """
+    d = len(lattice.cells)
+    cell, side = pyramids // (2 * d), pyramids % (2 * d)
+    axis, upper = side[:, None] // 2, side % 2
+    indices: list[Tensor] = []
+    for count in lattice.cells[::-1]:
+        indices.append(cell % count)
+        cell = cell // count
+    # in half cells from the cell's centre
+    place = 2.0 * (offsets / offsets.new_tensor(lattice.spacing) - torch.stack(indices[::-1], dim=1)) - 1.0
+    height = place.gather(1, axis)[:, 0] * (2 * upper - 1)
+    others = torch.arange(d - 1, device=axis.device).expand(len(axis), -1)
+    across = place.gather(1, others + (others >= axis)) / height.clamp_min(_AT_CENTRE)[:, None]
+    weights = height[:, None]
+    for along in across.unbind(1):
+        weights = (weights[:, :, None] * torch.stack([0.5 - 0.5 * along, 0.5 + 0.5 * along], 1)[:, None]).flatten(1)
+    return torch.cat([weights, 1.0 - height[:, None]], dim=1)
