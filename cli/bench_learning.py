@@ -56,7 +56,7 @@ def learning(
         outcomes = measure_learning(
             roadmap, options, labels=names, points=points, on_epoch=_show_epoch, progress=progress
         )
-        warm = compare_warm_starts(outcomes[0].ik, roadmap, seed=seed + 1)
+        warm = compare_warm_starts(outcomes[0].ik, roadmap, points=points, seed=seed + 1)
     if json_file is not None:
         rows = {"runs": [outcome.to_dict() for outcome in outcomes], "warm_start": [row.to_dict() for row in warm]}
         with atomic_write(json_file) as path:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from grr_torch.errors import UnknownNameError
 from grr_torch.learning.dataset import RoadmapDataset
-from grr_torch.learning.evaluate import Evaluation, draw_part, evaluate_ik, median_time, split_of
+from grr_torch.learning.evaluate import Evaluation, check_origin, draw_part, evaluate_ik, median_time, split_of
 from grr_torch.learning.neural_ik import NeuralIK
 from grr_torch.learning.options import Epoch, TrainingOptions
 from grr_torch.learning.region import certified_region
@@ -32,8 +32,6 @@ LABELS = {
 PUBLISHED = ("IKFlow, Panda, SE(3), many solutions a pose", 6.66, 2.03)
 # random starts for a point until one leads there
 _STARTS = 20
-# points of the comparison of warm starts
-_WARM = 100_000
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,7 @@ def independent_solutions(
     return q, valid
 
 
-def compare_warm_starts(ik: NeuralIK, roadmap: Roadmap, *, points: int = _WARM, seed: int = 1) -> list[WarmStart]:
+def compare_warm_starts(ik: NeuralIK, roadmap: Roadmap, *, points: int = 20_000, seed: int = 1) -> list[WarmStart]:
     """Solves held-out points exactly: by the roadmap, and from the network's configurations.
 
     Args:
@@ -154,7 +152,11 @@ def compare_warm_starts(ik: NeuralIK, roadmap: Roadmap, *, points: int = _WARM, 
         roadmap: The roadmap.
         points: How many.
         seed: Of their draw.
+
+    Raises:
+        ParameterError: The network learned another roadmap, or the number is not valid.
     """
+    check_origin(ik, roadmap)
     robot, task, tolerances = roadmap.robot, roadmap.task, Tolerances(**roadmap.parameters["tolerances"])
     generator = torch.Generator().manual_seed(seed)
     held_out = draw_part(roadmap, certified_region(roadmap), split_of(ik), "test", points, generator)

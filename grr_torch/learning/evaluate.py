@@ -30,7 +30,7 @@ Solver = Callable[[Tensor], Tensor]
 _EXACT_POSITION, _EXACT_ROTATION = 1e-4, math.radians(0.1)
 # waypoints of a line in a centimetre, and lines and loops drawn
 _PER_CENTIMETRE = 10
-_LINES, _LOOPS, _LOOP_POINTS = 200, 64, 120
+_LINES, _LOOPS, _LOOP_POINTS = 200, 64, 100
 # points drawn at once to find some of a part, and how often
 _DRAWN, _MOST_DRAWS = 1 << 14, 200
 # poses at once for the speed of a batch, and calls of which medians are taken
@@ -257,13 +257,13 @@ def _quantile(values: Tensor, share: float) -> float:
     return float(np.quantile(kept.cpu().numpy(), share)) if kept.numel() else math.nan
 
 
-def newton_closure(roadmap: Roadmap, start: Tensor, loops: Tensor, rounds: int = 3) -> float:
+def newton_closure(roadmap: Roadmap, start: Tensor, loops: Tensor) -> float:
     """Largest joint difference [rad or m] after following loops (L, W, d) by Newton steps from where the arm stands."""
     q = start
-    for _ in range(rounds):
-        for points in loops.unbind(1):
-            q = newton_steps(roadmap.robot, roadmap.task, points, q, 3, Tolerances())[0]
     first = newton_steps(roadmap.robot, roadmap.task, loops[:, 0], start, 3, Tolerances())[0]
+    q = first
+    for points in loops[:, 1:].unbind(1):
+        q = newton_steps(roadmap.robot, roadmap.task, points, q, 3, Tolerances())[0]
     turned = difference(first, q, roadmap.robot.continuous).abs()
     return _quantile(turned, 1.0)
 
