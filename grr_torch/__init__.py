@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from grr_torch.applications.teleoperate import Command, Teleoperator
     from grr_torch.errors import GrrError, GrrWarning
     from grr_torch.learning.dataset import RoadmapDataset
+    from grr_torch.learning.evaluate import evaluate_ik
+    from grr_torch.learning.export import export_dataset
     from grr_torch.learning.neural_ik import NeuralIK
     from grr_torch.learning.options import TrainingOptions
     from grr_torch.learning.split import Split
@@ -42,6 +44,8 @@ _HOMES = {
     "GrrError": "errors",
     "GrrWarning": "errors",
     "RoadmapDataset": "learning.dataset",
+    "evaluate_ik": "learning.evaluate",
+    "export_dataset": "learning.export",
     "NeuralIK": "learning.neural_ik",
     "TrainingOptions": "learning.options",
     "Split": "learning.split",
@@ -88,7 +92,9 @@ __all__ = [
     "TrainingOptions",
     "__version__",
     "build",
+    "evaluate_ik",
     "expand",
+    "export_dataset",
     "is_continuous",
     "load_preset",
     "load_robot",

@@ -74,7 +74,9 @@ class IkNetwork(nn.Module):
     def encoded(self, inputs: Tensor) -> Tensor:
         """Encoded configurations (N, width) of normalised points (N, d)."""
         phases = self.waves(inputs)
-        x = silu(self.first(torch.cat([inputs, phases.sin(), phases.cos()], dim=-1)))
+        # in place, a third less time goes into memory; but a gradient needs what would be overwritten
+        in_place = not torch.is_grad_enabled()
+        x = silu(self.first(torch.cat([inputs, phases.sin(), phases.cos()], dim=-1)), inplace=in_place)
         for layer in self.hidden:
-            x = silu(layer(x))
+            x = silu(layer(x), inplace=in_place)
         return self.last(x)

@@ -124,15 +124,14 @@ class NeuralIK:
         Raises:
             ParameterError: The width is not the task's, or a value is not finite.
         """
-        rows = point_columns(self.robot, self.task, points).T.to(device="cpu", dtype=torch.float32)
+        rows = point_columns(self.robot, self.task, points).T.cpu()
+        q = torch.empty(len(rows), self.robot.n, dtype=self.robot.dtype)
         with torch.no_grad(), one_thread():
-            if len(rows) <= _AT_ONCE:
-                q = self.network(rows)
-            else:
-                q = rows.new_empty(len(rows), self.robot.n)
-                for start in range(0, len(rows), _AT_ONCE):
-                    q[start : start + _AT_ONCE] = self.network(rows[start : start + _AT_ONCE])
-        return q.to(self.robot.lower).reshape(*points.shape[:-1], self.robot.n)
+            # what is a piece here is read, computed and written while it is in the cache
+            for start in range(0, len(rows), _AT_ONCE):
+                part = slice(start, start + _AT_ONCE)
+                q[part] = self.network(rows[part].to(torch.float32, memory_format=torch.contiguous_format))
+        return q.to(self.robot.device).reshape(*points.shape[:-1], self.robot.n)
 
     def refine(self, points: Tensor, steps: int = 2) -> tuple[Tensor, Tensor]:
         """The network's configurations after a few Newton steps towards the points.
