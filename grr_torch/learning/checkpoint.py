@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,36 +27,44 @@ def checkpoint_path(out: str | os.PathLike[str]) -> Path:
     return path.with_name(f"{path.stem}.checkpoint{path.suffix}")
 
 
-def save_checkpoint(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-    """Writes a state, by an atomic rename: the one before stays until then.
+@dataclass(frozen=True)
+class Checkpoint:
+    """The file in which a training keeps its state.
 
-    Raises:
-        OutputError: It cannot be written.
-    """
-    kept = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
-    header = {"format": FORMAT, "format_version": FORMAT_VERSION, "tensors_sha256": tensors_hash(kept), **metadata}
-    with atomic_write(path) as temporary:
-        save_file(kept, temporary, metadata={key: json.dumps(value) for key, value in header.items()})
-
-
-def load_checkpoint(path: Path, identity: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Reads a state.
-
-    Args:
+    Attributes:
         path: The file.
-        identity: Metadata that it must have: those of the training that goes on.
-
-    Raises:
-        FileFormatError: It is missing, truncated, damaged, or of another training.
+        identity: What tells this training from others: its options, and what its network is for.
     """
-    metadata, tensors = read_tensor_file(path, FORMAT, FORMAT_VERSION, "a state of a training")
-    wanted = json.loads(json.dumps(dict(identity)))
-    others = [name for name, value in _flat(wanted).items() if _flat(metadata).get(name) != value]
-    if others:
-        raise FileFormatError(path, f"is of a training with other {', '.join(others)}")
-    if tensors_hash(tensors) != metadata.get("tensors_sha256") or not {"epoch", "best"} <= set(metadata):
-        raise FileFormatError(path, "holds another state than was written")
-    return metadata, tensors
+
+    path: Path
+    identity: Mapping[str, Any]
+
+    def save(self, tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:
+        """Writes a state, by an atomic rename: the one before stays until then.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        kept = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
+        header = {"format": FORMAT, "format_version": FORMAT_VERSION, "tensors_sha256": tensors_hash(kept)}
+        metadata = {**header, **progress, **self.identity}
+        with atomic_write(self.path) as temporary:
+            save_file(kept, temporary, metadata={key: json.dumps(value) for key, value in metadata.items()})
+
+    def load(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """Reads a state: its metadata and tensors.
+
+        Raises:
+            FileFormatError: It is missing, truncated, damaged, or of another training.
+        """
+        metadata, tensors = read_tensor_file(self.path, FORMAT, FORMAT_VERSION, "a state of a training")
+        wanted, found = _flat(json.loads(json.dumps(dict(self.identity)))), _flat(metadata)
+        others = [name for name, value in wanted.items() if found.get(name) != value]
+        if others:
+            raise FileFormatError(self.path, f"is of a training with other {', '.join(others)}")
+        if tensors_hash(tensors) != metadata.get("tensors_sha256") or not {"epoch", "best"} <= set(metadata):
+            raise FileFormatError(self.path, "holds another state than was written")
+        return metadata, tensors
 
 
 def _flat(data: Mapping[str, Any]) -> dict[str, Any]:

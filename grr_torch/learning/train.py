@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError, TrainingError
-from grr_torch.learning.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
+from grr_torch.learning.checkpoint import Checkpoint, checkpoint_path
 from grr_torch.learning.dataset import RoadmapDataset
 from grr_torch.learning.loss import IkLoss
 from grr_torch.learning.network import IkNetwork
@@ -75,17 +75,20 @@ def train_ik(
         raise ParameterError("resume", "no file", "the file that was to be written")
     if out is not None:
         check_weights_path("out", out)
+    identity = {"options": options.to_dict(), "origin": Origin.of(roadmap, {}).to_dict()}
+    checkpoint = None if out is None else Checkpoint(checkpoint_path(out), identity)
+    state = checkpoint.load() if checkpoint is not None and resume else None
     if dataset is None:
         dataset = RoadmapDataset(roadmap, options.samples, split=options.parted(), seed=options.seed, progress=progress)
-    training = _Training(roadmap, options, dataset, None if out is None else checkpoint_path(out))
-    if resume:
-        training.resume()
+    training = _Training(roadmap, options, dataset, checkpoint)
+    if state is not None:
+        training.resume(*state)
     with one_thread():
         network, record = training.run(on_epoch or (lambda epoch: None))
     ik = NeuralIK(network, roadmap.robot, Origin.of(roadmap, {"options": options.to_dict(), **record}))
-    if out is not None:
+    if out is not None and checkpoint is not None:
         ik.save(out)
-        checkpoint_path(out).unlink(missing_ok=True)
+        checkpoint.path.unlink(missing_ok=True)
     return ik
 
 
@@ -105,7 +108,7 @@ class _Training:
     """The state of a training."""
 
     def __init__(
-        self, roadmap: Roadmap, options: TrainingOptions, dataset: RoadmapDataset, checkpoint: Path | None
+        self, roadmap: Roadmap, options: TrainingOptions, dataset: RoadmapDataset, checkpoint: Checkpoint | None
     ) -> None:
         self.options, self.dataset, self.checkpoint = options, dataset, checkpoint
         self.parts = {part: dataset.indices(part) for part in ("train", "validation")}
@@ -126,7 +129,6 @@ class _Training:
         # figures of the best epoch, and its weights
         self.epoch, self.best = 0, {"epoch": 0.0, "validation": math.inf}
         self.best_state = self._weights()
-        self.identity = {"options": options.to_dict(), "origin": Origin.of(roadmap, {}).to_dict()}
 
     def run(self, on_epoch: Callable[[Epoch], None]) -> tuple[IkNetwork, dict[str, float]]:
         """Trains to the end; gives the best network, and its figures."""
@@ -135,14 +137,14 @@ class _Training:
             loss = self._train()
             figures = self._validate() if math.isfinite(loss) else {"validation": loss}
             if not math.isfinite(figures["validation"]):
-                kept = self.checkpoint if self.checkpoint is not None and self.epoch else None
+                kept = self.checkpoint.path if self.checkpoint is not None and self.epoch else None
                 raise TrainingError(self.epoch + 1, "the loss is not finite; a lower learning rate may help", kept)
             self.epoch += 1
             if figures["validation"] < self.best["validation"]:
                 self.best = {"epoch": float(self.epoch), **figures}
                 self.best_state = self._weights()
             if self.checkpoint is not None:
-                save_checkpoint(self.checkpoint, self._state(), self._progress())
+                self.checkpoint.save(self._state(), {"epoch": self.epoch, "best": self.best})
             seconds = time.perf_counter() - begin
             left = seconds / (self.epoch - first) * (self.options.epochs - self.epoch)
             best = int(self.best["epoch"])
@@ -151,14 +153,8 @@ class _Training:
         self.network.load_state_dict(self.best_state)
         return self.network, self.best
 
-    def resume(self) -> None:
-        """Takes up the state of the checkpoint.
-
-        Raises:
-            FileFormatError: It is missing, or of another training.
-        """
-        assert self.checkpoint is not None
-        metadata, tensors = load_checkpoint(self.checkpoint, self.identity)
+    def resume(self, metadata: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+        """Takes up the state of a checkpoint."""
         self.epoch, self.best = int(metadata["epoch"]), dict(metadata["best"])
         parts: dict[str, dict[str, Tensor]] = {name: {} for name in ("network", "best", "first", "second")}
         for name, tensor in tensors.items():
@@ -239,6 +235,3 @@ class _Training:
             **{f"first.{k}": moment["exp_avg"] for k, moment in moments.items()},
             **{f"second.{k}": moment["exp_avg_sq"] for k, moment in moments.items()},
         }
-
-    def _progress(self) -> dict[str, Any]:
-        return {"epoch": self.epoch, "best": self.best, **self.identity}
