@@ -23,7 +23,9 @@ def learning(
         Path | None,
         typer.Argument(help="A roadmap file; by default the Kinova preset's roadmap is built.", metavar="[FILE.grr]"),
     ] = None,
-    labels: Annotated[str, typer.Option(help="Of roadmap,independent,none.")] = "roadmap,independent,none",
+    labels: Annotated[str, typer.Option(help="Of those below; all by default.")] = (
+        "roadmap,independent,none,roadmap-joints,independent-joints"
+    ),
     epochs: Annotated[int, typer.Option(help="Times that each sample is seen.")] = 80,
     samples: Annotated[int, typer.Option(help="Points drawn, a tenth each for validation and test.")] = 500_000,
     points: Annotated[int, typer.Option(help="Held-out points that are measured.")] = 20_000,
@@ -32,12 +34,13 @@ def learning(
 ) -> None:
     """Print what a network learns from a roadmap, beside the same network with other labels, as Markdown tables.
 
-    The labels are the roadmap's configurations, those of inverse kinematics from random starts, each point by itself,
-    or none: then the loss is that of forward kinematics alone. With the defaults, each takes minutes.
+    Labels are the roadmap's configurations (roadmap), those of inverse kinematics from random starts, each point by
+    itself (independent), or none: then the loss is that of forward kinematics alone. With roadmap-joints and
+    independent-joints it is that in joint space alone. With the defaults, each takes minutes.
 
     Example: grr-torch bench learning kinova.grr --epochs 10 --samples 100000
     """
-    from grr_torch.experiments.learning import compare_warm_starts, measure_learning
+    from grr_torch.experiments.learning import LABELS, compare_warm_starts, measure_learning
     from grr_torch.experiments.timing import machine
     from grr_torch.learning.options import TrainingOptions
     from grr_torch.output import atomic_write, check_writable
@@ -47,7 +50,7 @@ def learning(
 
     names = [name.strip() for name in labels.split(",") if name.strip()]
     if not names:
-        raise ParameterError("--labels", repr(labels), "some of roadmap, independent, none")
+        raise ParameterError("--labels", repr(labels), f"some of {', '.join(LABELS)}")
     options = TrainingOptions(samples=samples, epochs=epochs, seed=seed)
     if json_file is not None:
         check_writable(json_file)
@@ -98,7 +101,7 @@ def _continuity_table(outcomes: list[Outcome]) -> str:
 
     head = ["labels", "joint step over 1 cm [rad]: 99.9 %, largest", "the roadmap's own", "ratio of the largest"]
     head += ["after closed loops [rad]", "Newton steps round them", "beyond limits", "in self-collision"]
-    head += ["poses / s", "one pose [ms]"]
+    head += ["from the map [rad], mean", "poses / s", "one pose [ms]"]
     rows = []
     for outcome in outcomes:
         figures = outcome.evaluation
@@ -113,6 +116,7 @@ def _continuity_table(outcomes: list[Outcome]) -> str:
                 f"{figures.newton_closure:.2g}",
                 f"{100.0 * figures.beyond_limits:.2f} %",
                 f"{100.0 * figures.in_self_collision:.2f} %",
+                f"{figures.from_map:.3f}",
                 f"{figures.poses_per_second:,.0f}",
                 f"{1e3 * figures.one_pose:.3f}",
             ]

@@ -337,12 +337,14 @@ def test_places_that_cannot_be_written_are_found_before_the_work(planar_roadmap,
 
 
 def test_values_outside_their_range_are_refused(planar_roadmap, trained):
-    for wrong in ({"epochs": 0}, {"samples": -1}, {"batch": 1.5}, {"learning_rate": math.nan}, {"joint_weight": -1.0}):
+    for wrong in ({"epochs": 0}, {"samples": -1}, {"batch": 1.5}, {"learning_rate": math.nan}, {"pose_weight": -1.0}):
         with pytest.raises(ParameterError):
             TrainingOptions(**wrong)
     for wrong in ({"test": 1.0}, {"validation": 0.5, "test": 0.5}, {"block": 0.0}, {"seed": -1}):
         with pytest.raises(ParameterError):
             Split(**wrong)
+    with pytest.raises(ParameterError, match="at least one"):
+        TrainingOptions(joint_weight=0.0, pose_weight=0.0)
     with pytest.raises(UnknownNameError):
         Split("blocks")
     with pytest.raises(ParameterError, match="blocks"):

@@ -27,6 +27,8 @@ LABELS = {
     "roadmap": "the roadmap's configurations",
     "independent": "IK from random starts, each point by itself",
     "none": "forward kinematics alone",
+    "roadmap-joints": "the roadmap's configurations, joint space alone",
+    "independent-joints": "IK from random starts, joint space alone",
 }
 # others' figures, of other robots, tasks and networks
 PUBLISHED = ("IKFlow, Panda, SE(3), many solutions a pose", 6.66, 2.03)
@@ -117,13 +119,19 @@ def measure_learning(
             on_epoch(name, epoch)
 
         given = dataset
-        if name == "independent":
+        if name.startswith("independent"):
             given = dataset.relabelled(*independent_solutions(roadmap, dataset.points, options.seed, progress))
-        weight = 0.0 if name == "none" else options.joint_weight
-        ik = train_ik(roadmap, replace(options, joint_weight=weight), dataset=given, on_epoch=note)
+        ik = train_ik(roadmap, weighted(options, name), dataset=given, on_epoch=note)
         evaluation = evaluate_ik(ik, roadmap, points=points, seed=options.seed + 1)
         outcomes.append(Outcome(name, last[0].seconds, last[0].epoch, evaluation, ik))
     return outcomes
+
+
+def weighted(options: TrainingOptions, labels: str) -> TrainingOptions:
+    """Options of a training with some labels: without the loss in joint space, or without the tool's, or with both."""
+    if labels == "none":
+        return replace(options, joint_weight=0.0)
+    return replace(options, pose_weight=0.0) if labels.endswith("-joints") else options
 
 
 def independent_solutions(

@@ -20,7 +20,8 @@ class TrainingOptions:
         epochs: Times that each training sample is seen.
         batch: Samples of a step.
         learning_rate: Of Adam, at its highest; it falls along a cosine to a thousandth.
-        joint_weight: Of the loss in joint space; the pose's is 1. At 0 the map's configurations do not count.
+        joint_weight: Of the loss in joint space. At 0 the map's configurations do not count.
+        pose_weight: Of the tool's part. At 0 it is the configurations alone that count.
         patience: Epochs without a better validation loss after which training stops.
         seed: Of samples, split, weights and batches.
         split: Training, validation and test; None: by region, of the same seed.
@@ -32,6 +33,7 @@ class TrainingOptions:
     batch: int = 2048
     learning_rate: float = 3e-3
     joint_weight: float = 1.0
+    pose_weight: float = 1.0
     patience: int = 30
     seed: int = 0
     split: Split | None = None
@@ -44,8 +46,11 @@ class TrainingOptions:
                 raise ParameterError(name, value, "a whole number, 1 or more")
         if not 0.0 < self.learning_rate < math.inf:
             raise ParameterError("learning rate", self.learning_rate, "above 0 and finite")
-        if not 0.0 <= self.joint_weight < math.inf:
-            raise ParameterError("joint weight", self.joint_weight, "0 or more and finite")
+        for name in ("joint_weight", "pose_weight"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ParameterError(name.replace("_", " "), getattr(self, name), "0 or more and finite")
+        if self.joint_weight == self.pose_weight == 0.0:
+            raise ParameterError("joint weight and pose weight", "both 0", "at least one of them above 0")
         check_seed(self.seed)
 
     def parted(self) -> Split:

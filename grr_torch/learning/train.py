@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 # the share of the training in which the loss of the pose sets in: it is only then that the joints are near the map's,
 # and that they do not settle where the tool is right and the map is not
-_POSE_BEGINS, _POSE_WHOLE = 0.05, 0.15
+_POSE_BEGINS, _POSE_WHOLE = 0.15, 0.3
 # steps in which the learning rate grows to its value, at most
 _WARM_UP = 200
 # resolved vertices without which there is no map to learn
@@ -197,8 +197,9 @@ class _Training:
 
     def _pose_weight(self, done: float) -> float:
         if self.options.joint_weight == 0.0:
-            return 1.0
-        return min(1.0, max(0.0, (done - _POSE_BEGINS) / (_POSE_WHOLE - _POSE_BEGINS)))
+            return self.options.pose_weight
+        share = (done - _POSE_BEGINS) / (_POSE_WHOLE - _POSE_BEGINS)
+        return self.options.pose_weight * min(1.0, max(0.0, share))
 
     def _losses(self, batch: Tensor, pose_weight: float) -> Tensor:
         inputs, targets = self.dataset[batch]
@@ -215,7 +216,7 @@ class _Training:
             for batch in rows.split(self.options.batch):
                 inputs, targets = self.dataset[batch]
                 loss = self.loss(self.network.encoded(inputs), targets, self.points[batch])
-                whole = loss.pose(self.scale)
+                whole = self.options.pose_weight * loss.pose(self.scale)
                 if self.options.joint_weight > 0.0:
                     whole = whole + self.options.joint_weight * loss.joints
                 parts = (whole, 1e3 * loss.position.sqrt(), loss.rotation.sqrt().rad2deg())
