@@ -14,6 +14,13 @@ if TYPE_CHECKING:
     from grr_torch.applications.solve import Solution
     from grr_torch.applications.teleoperate import Command, Teleoperator
     from grr_torch.errors import GrrError, GrrWarning
+    from grr_torch.learning.dataset import RoadmapDataset
+    from grr_torch.learning.evaluate import evaluate_ik
+    from grr_torch.learning.export import export_dataset
+    from grr_torch.learning.neural_ik import NeuralIK
+    from grr_torch.learning.options import TrainingOptions
+    from grr_torch.learning.split import Split
+    from grr_torch.learning.train import train_ik
     from grr_torch.projection.continuity import is_continuous
     from grr_torch.projection.project import Tolerances, project
     from grr_torch.resolution.build import build
@@ -36,6 +43,13 @@ _HOMES = {
     "Teleoperator": "applications.teleoperate",
     "GrrError": "errors",
     "GrrWarning": "errors",
+    "RoadmapDataset": "learning.dataset",
+    "evaluate_ik": "learning.evaluate",
+    "export_dataset": "learning.export",
+    "NeuralIK": "learning.neural_ik",
+    "TrainingOptions": "learning.options",
+    "Split": "learning.split",
+    "train_ik": "learning.train",
     "is_continuous": "projection.continuity",
     "Tolerances": "projection.project",
     "project": "projection.project",
@@ -61,20 +75,26 @@ __all__ = [
     "FixedRotation",
     "GrrError",
     "GrrWarning",
+    "NeuralIK",
     "Path",
     "Position",
     "Roadmap",
+    "RoadmapDataset",
     "Robot",
     "SelfMotionManifold",
     "Solution",
     "SphereModel",
+    "Split",
     "TaskGraph",
     "TaskSpace",
     "Teleoperator",
     "Tolerances",
+    "TrainingOptions",
     "__version__",
     "build",
+    "evaluate_ik",
     "expand",
+    "export_dataset",
     "is_continuous",
     "load_preset",
     "load_robot",
@@ -83,6 +103,7 @@ __all__ = [
     "robot_names",
     "self_motion_manifold",
     "staggered_grid",
+    "train_ik",
 ]
 
 

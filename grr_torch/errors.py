@@ -136,6 +136,20 @@ class OutputError(GrrError):
         super().__init__(f"cannot write {path}: {reason}")
 
 
+class TrainingError(GrrError):
+    """Training that cannot go on.
+
+    Attributes:
+        epoch: The epoch in which it stopped, counted from 1.
+        checkpoint: The file that holds the last good state; None where none is kept.
+    """
+
+    def __init__(self, epoch: int, reason: str, checkpoint: Path | None) -> None:
+        self.epoch, self.checkpoint = epoch, checkpoint
+        kept = "no checkpoint is kept" if checkpoint is None else f"the last good state is in {checkpoint}"
+        super().__init__(f"training stopped in epoch {epoch}: {reason}; {kept}")
+
+
 class MissingPackageError(GrrError, ImportError):
     """A package that only a part of grr_torch needs, and that is not installed.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from csv import reader as csv_rows
@@ -70,7 +71,13 @@ def read_points(path: Path, width: int) -> Iterator[Array]:
 
 @contextmanager
 def table_writer(
-    path: Path, columns: Columns, count: int, constants: Mapping[str, Array] | None = None
+    path: Path,
+    columns: Columns,
+    count: int,
+    constants: Mapping[str, Array] | None = None,
+    *,
+    metadata: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> Iterator[Callable[[dict[str, Array]], None]]:
     """Gives a function that appends rows to a table, which appears when all are written, or not at all.
 
@@ -81,6 +88,8 @@ def table_writer(
         columns: Names of the columns by array.
         count: How many rows there will be.
         constants: Further arrays, for an .npz.
+        metadata: Texts for the schema of a .parquet.
+        units: Units of columns, for the fields of a .parquet.
 
     Raises:
         ParameterError: The suffix is not known.
@@ -95,7 +104,7 @@ def table_writer(
         elif suffix == ".npz":
             yield stack.enter_context(_write_npz(temporary, count, constants or {}))
         else:
-            yield stack.enter_context(_write_arrow(temporary, columns, suffix))
+            yield stack.enter_context(_write_arrow(temporary, columns, suffix, metadata, units or {}))
 
 
 def unique_names(joints: Sequence[str], taken: Iterable[str]) -> list[str]:
@@ -166,7 +175,9 @@ def _read_npy(path: Path, width: int) -> Iterator[Array]:
 
 
 @contextmanager
-def _write_arrow(path: Path, columns: Columns, suffix: str) -> Iterator[Callable[[dict[str, Array]], None]]:
+def _write_arrow(
+    path: Path, columns: Columns, suffix: str, metadata: Mapping[str, str] | None, units: Mapping[str, str]
+) -> Iterator[Callable[[dict[str, Array]], None]]:
     import pyarrow
     from pyarrow import csv, parquet
 
@@ -177,7 +188,10 @@ def _write_arrow(path: Path, columns: Columns, suffix: str) -> Iterator[Callable
         def write(arrays: dict[str, Array]) -> None:
             nonlocal writer
             values = [part for group in columns for part in _parts(arrays[group])]
-            table = pyarrow.table([pyarrow.array(np.ascontiguousarray(part)) for part in values], names=names)
+            parts = [pyarrow.array(np.ascontiguousarray(part)) for part in values]
+            fields = [pyarrow.field(name, part.type) for name, part in zip(names, parts, strict=True)]
+            fields = [part.with_metadata({"unit": units[part.name]}) if part.name in units else part for part in fields]
+            table = pyarrow.table(parts, schema=pyarrow.schema(fields, metadata=metadata))
             if writer is None:
                 quotes = "needed" if set(',"\r\n') & set("".join(names)) else "none"
                 plain = csv.WriteOptions(quoting_style=quotes, quoting_header=quotes)
@@ -218,24 +232,27 @@ def _write_npy(path: Path, columns: Columns, count: int) -> Iterator[Callable[[d
 @contextmanager
 def _write_npz(path: Path, count: int, constants: Mapping[str, Array]) -> Iterator[Callable[[dict[str, Array]], None]]:
     """Arrays grow on the disk beside the file, and are put into it at the end."""
-    tables: dict[str, Any] = {}
-    done = 0
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f"{path.name}.") as folder:
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f"{path.name}.") as folder, ExitStack() as stack:
+        files: dict[str, Any] = {}
+        kinds: dict[str, Any] = {}
 
         def write(arrays: dict[str, Array]) -> None:
-            nonlocal done
             for group, part in arrays.items():
-                if group not in tables:
-                    place = Path(folder) / f"{group}.npy"
-                    shape = (count, *part.shape[1:])
-                    tables[group] = np.lib.format.open_memmap(place, mode="w+", dtype=_stored(part), shape=shape)
-                tables[group][done : done + len(part)] = part
-            done += len(next(iter(arrays.values())))
+                if group not in files:
+                    kinds[group] = _stored(part)
+                    files[group] = stack.enter_context((Path(folder) / f"{group}.npy").open("wb"))
+                    descr = np.lib.format.dtype_to_descr(kinds[group])
+                    about = {"descr": descr, "fortran_order": False, "shape": (count, *part.shape[1:])}
+                    np.lib.format.write_array_header_1_0(files[group], about)
+                files[group].write(np.ascontiguousarray(part, dtype=kinds[group]).tobytes())
 
         yield write
-        with path.open("wb") as file:
-            np.savez(file, **{**tables, **constants})
-        tables.clear()
+        for group, array in constants.items():
+            np.save(Path(folder) / f"{group}.npy", array, allow_pickle=False)
+        stack.close()
+        with zipfile.ZipFile(path, "w") as file:
+            for place in sorted(Path(folder).iterdir()):
+                file.write(place, place.name)
 
 
 def _parts(array: Array) -> list[Array]:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -27,6 +26,7 @@ from grr_torch.robots.read_urdf import parse_urdf
 from grr_torch.robots.robot import Robot
 from grr_torch.robots.spheres import SphereModel
 from grr_torch.spaces.task import task_from_json
+from grr_torch.tensor_file import read_tensor_file
 from grr_torch.version import __version__
 
 FORMAT = "grr-torch roadmap"
@@ -46,11 +46,7 @@ _REQUIRED = tuple(name for name in _DTYPES if name != "reachable")
 
 def save_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
     """Writes a roadmap; see `Roadmap.save`."""
-    tensors = {
-        name: getattr(roadmap, name).detach().cpu().contiguous().to(dtype)
-        for name, dtype in _DTYPES.items()
-        if getattr(roadmap, name) is not None
-    }
+    tensors = _tensors(roadmap)
     metadata = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -66,6 +62,11 @@ def save_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
     metadata["metadata_sha256"] = metadata_hash(metadata)
     with atomic_write(path) as temporary:
         save_file(tensors, temporary, metadata={key: json.dumps(value) for key, value in metadata.items()})
+
+
+def roadmap_hash(roadmap: Roadmap) -> str:
+    """The `tensors_sha256` that a roadmap's file has, by which others name the roadmap that they are made from."""
+    return tensors_hash(_tensors(roadmap))
 
 
 def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
@@ -114,23 +115,7 @@ def read_file(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, T
     Raises:
         FileFormatError: It is missing, truncated, of another version, or not a roadmap.
     """
-    if not Path(path).is_file():
-        raise FileFormatError(path, "is not a file")
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
-            if header.get("format") != json.dumps(FORMAT):
-                raise FileFormatError(path, "is not a roadmap of grr-torch")
-            version = json.loads(header.get("format_version", "null"))
-            if version != FORMAT_VERSION:
-                raise FileFormatError(path, f"is of format version {version}; this version reads {FORMAT_VERSION}")
-            metadata = {key: json.loads(value) for key, value in header.items()}
-            names = list(file.keys())
-            return metadata, {name: file.get_tensor(name) for name in names}
-    except SafetensorError as error:
-        raise FileFormatError(path, f"is truncated or not a roadmap: {error}") from error
-    except (json.JSONDecodeError, OSError) as error:
-        raise FileFormatError(path, f"cannot be read: {error}") from error
+    return read_tensor_file(path, FORMAT, FORMAT_VERSION, "a roadmap")
 
 
 def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
@@ -139,7 +124,7 @@ def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
     for name in sorted(tensors):
         tensor = tensors[name].contiguous()
         digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
-        digest.update(tensor.view(torch.uint8).numpy().tobytes() if tensor.numel() else b"")
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes() if tensor.numel() else b"")
     return digest.hexdigest()
 
 
@@ -147,6 +132,14 @@ def metadata_hash(metadata: Mapping[str, Any]) -> str:
     """SHA-256 over everything in the metadata but this hash itself."""
     others = {name: value for name, value in metadata.items() if name != "metadata_sha256"}
     return hashlib.sha256(json.dumps(others, sort_keys=True).encode()).hexdigest()
+
+
+def _tensors(roadmap: Roadmap) -> dict[str, Tensor]:
+    return {
+        name: getattr(roadmap, name).detach().cpu().contiguous().to(dtype)
+        for name, dtype in _DTYPES.items()
+        if getattr(roadmap, name) is not None
+    }
 
 
 def _robot_to_json(robot: Robot) -> dict[str, Any]:
