@@ -18,7 +18,7 @@ def _errors(notebook):
 
 
 def test_there_are_notebooks():
-    assert {"01", "02", "03", "05"} <= {path.name[:2] for path in NOTEBOOKS}
+    assert {"01", "02", "03", "04", "05"} <= {path.name[:2] for path in NOTEBOOKS}
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
