@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from grr_torch.applications.around import Around, AroundProduct
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress, silent
@@ -28,12 +28,8 @@ _SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_C
 
 # points worked on together
 _AT_ONCE = 1 << 12
-# a guess averages over so many vertices, in the plane and in space: a grid's first two shells
-_NEIGHBOURS = {2: 8, 3: 14}
 # the most vertices of which a matrix of neighbours is made: 16 MiB
 _MATRIX = 4096
-# no vertex farther than so many of the longest edges counts, and one must lie within one of them
-_FARTHEST = 1.5
 # radians of self-motion from the average beyond which a configuration is none of the map's
 _OFF_MAP = 0.5
 
@@ -80,10 +76,12 @@ class Solver:
         self.low, self.high = points.amin(0), points.amax(0)
         lengths = (points[roadmap.edges[:, 0]] - points[roadmap.edges[:, 1]]).norm(dim=1)
         self.radius = float(lengths.max()) if len(lengths) else math.inf
-        self._tree = cKDTree(points[vertices].numpy())
+        turning = self.task.rotations is not None
+        self._around = (AroundProduct if turning else Around)(roadmap, vertices, self.radius)
         self._embedded = embed(roadmap.configurations[vertices], self.robot.continuous.cpu())
         self._ends = _neighbour_table(roadmap, vertices)
         self._joined = _neighbour_matrix(self._ends) if len(vertices) <= _MATRIX else None
+        # where rotation varies, suspects are looked up by their nearest vertices
         self._lattice = roadmap.graph.lattice
         self._suspect = self._uncertified_places(roadmap)
 
@@ -138,20 +136,13 @@ class Solver:
         2n multiply-adds a neighbour, and k³ a doubling of the paths by which connected vertices are found.
         """
         positions = points[:, : self.task.dimension]
-        k = min(_NEIGHBOURS[self.task.dimension], len(self.vertices))
-        # the one after the k-th is at infinity where there is none
-        found = self._tree.query(positions.numpy(), k=range(1, k + 2))
-        distances, nearest = torch.from_numpy(found[0]), torch.from_numpy(found[1])[:, :k]
-        reach = distances[:, k:].clamp_max(_FARTHEST * self.radius)
-        weights = (reach / distances[:, :k].clamp_min(1e-12) - 1.0).clamp_min_(0.0).square_()
-        if not math.isfinite(self.radius):
-            weights = distances[:, :k].clamp_min(1e-12).square().reciprocal()
-        weights *= self._largest_part(nearest)
+        nearest, weights, near = self._around.weigh(points)
+        weights = weights * self._largest_part(nearest, weights > 0.0)
         sums = embedding_bag(nearest, self._embedded, per_sample_weights=weights, mode="sum")
         codes = torch.full((len(points),), _SOLVED, dtype=torch.uint8)
         if self._suspect is not None:
             codes[self._suspect[self._place(positions, nearest[:, 0])]] = _UNCERTIFIED
-        codes[(distances[:, 0] > self.radius) | ~(weights.sum(1) > 0.0)] = _TOO_FAR
+        codes[~near | ~(weights.sum(1) > 0.0)] = _TOO_FAR
         slack = 1e-9
         codes[((positions < self.low - slack) | (positions > self.high + slack)).any(1)] = _OUTSIDE
         return average(sums, self.robot.continuous.cpu()), codes
@@ -167,7 +158,9 @@ class Solver:
         result = q.isfinite().all(1)
         if len(far):
             columns = motion[far].T
-            jacobian = self.task.jacobian(self.robot.tree.jacobian(self.robot.tree.frames(q[far].T.contiguous())))
+            frames = self.robot.tree.frames(q[far].T.contiguous())
+            points = self.task.at(*self.robot.tree.tool_pose(frames))
+            jacobian = self.task.jacobian(self.robot.tree.jacobian(frames), points)
             moved = (jacobian * columns).sum(1)
             across = damped_least_squares(jacobian, moved, torch.full_like(moved[0], 1e-6))
             result[far] &= (columns - across).norm(dim=0) <= _OFF_MAP
@@ -175,19 +168,23 @@ class Solver:
 
     def nearest(self, points: Tensor, k: int = 1) -> tuple[Tensor, Tensor]:
         """The k nearest resolved vertices of points (N, width) on the CPU: distances (N, k) and vertices (N, k)."""
-        positions = points[:, : self.task.dimension].numpy()
-        distances, index = self._tree.query(positions, k=range(1, min(k, len(self.vertices)) + 1))
-        return torch.from_numpy(distances), self.vertices[torch.from_numpy(index)]
+        distances, index = self._around.nearest(points, k)
+        return distances, self.vertices[index]
 
-    def _largest_part(self, nearest: Tensor) -> Tensor:
-        """Which of the vertices (N, k) lie in the largest part connected by edges among them; the nearest of equals."""
+    def _largest_part(self, nearest: Tensor, counts: Tensor) -> Tensor:
+        """Which of the vertices (N, k) lie in the largest part connected by edges among them; the nearest of equals.
+
+        Only those that count (N, k) do.
+        """
         k = nearest.shape[1]
         if self._joined is not None:
             paths = self._joined[nearest[:, :, None], nearest[:, None, :]].float()
         else:
             near = nearest.to(torch.int32)
             paths = (self._ends[nearest][..., None] == near[:, None, None, :]).any(2).float()
-        paths.diagonal(dim1=1, dim2=2).fill_(1.0)
+        paths *= counts[:, :, None]
+        paths *= counts[:, None]
+        paths.diagonal(dim1=1, dim2=2).copy_(counts)
         for _ in range(math.ceil(math.log2(max(k, 2)))):
             paths = (paths @ paths).clamp_max_(1.0)
         sizes = paths.sum(2) * k - torch.arange(k)

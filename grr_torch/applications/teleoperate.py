@@ -81,9 +81,11 @@ class Teleoperator:
             timeout: An input older than this [s] is refused; see `step`.
 
         Raises:
-            ParameterError: A parameter is out of its range, or no vertex is resolved.
+            ParameterError: A parameter is out of its range, no vertex is resolved, or rotation varies in the task.
         """
         robot = roadmap.robot
+        if roadmap.task.rotations is not None:
+            raise ParameterError("task", roadmap.task.kind, "position or fixed-rotation: rotation is not teleoperated")
         if not 0.0 < rate < math.inf:
             raise ParameterError("rate", rate, "above 0, in Hz")
         for name, value in (("max_jump", max_jump), ("timeout", timeout)):

@@ -27,6 +27,17 @@ def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Tensor:
     )
 
 
+def matrix_from_quaternion(quaternions: Tensor) -> Tensor:
+    """Rotation matrices (3, 3, N) of unit quaternions (4, N)."""
+    w, x, y, z = quaternions
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row) for row in rows])
+
+
 def quaternion_from_matrix(rotation: Tensor) -> Tensor:
     """Unit quaternions (*batch, 4), w ≥ 0, of rotation matrices (*batch, 3, 3)."""
     m = rotation
@@ -49,8 +60,8 @@ def quaternion_from_matrix(rotation: Tensor) -> Tensor:
 
 
 def quaternion_distance(first: Tensor, second: Tensor) -> Tensor:
-    """D_SO(3) = 1 − |o_i · o_j| (*batch,) of unit quaternions (*batch, 4)."""
-    return 1.0 - (first * second).sum(-1).abs()
+    """D_SO(3) = 1 − |o_i · o_j| (*batch,) of unit quaternions (*batch, 4), as half the square of what is between them."""
+    return 0.5 * torch.minimum((first - second).square().sum(-1), (first + second).square().sum(-1))
 
 
 def slerp(start: Tensor, end: Tensor, fraction: float | Tensor) -> Tensor:
