@@ -112,8 +112,9 @@ def _turning(roadmap: Roadmap) -> list[tuple[str, str]]:
     graph = roadmap.graph
     if not isinstance(graph, ProductGraph):
         return []
+    d = roadmap.task.dimension
     places, turns = len(graph.positions.points), len(graph.rotations.values)
-    return [("grid", f"{places:,} positions × {turns:,} rotations ({', '.join(roadmap.task.rotations.names)})")]
+    return [("grid", f"{places:,} positions × {turns:,} rotations ({', '.join(roadmap.task.coordinates[d:])})")]
 
 
 def _steep_rows(roadmap: Roadmap, edges: Tensor) -> list[tuple[str, str]]:

@@ -22,8 +22,8 @@ def solve(
     point: Annotated[
         list[str] | None,
         typer.Option(
-            help="Point of the task space in metres; repeatable. Where rotation varies, then a yaw in radians, a direction, or "
-            "a quaternion W X Y Z.",
+            help="Point of the task space in metres; repeatable. Where rotation varies, a yaw in radians, a direction, "
+            "or a quaternion W X Y Z follows.",
             metavar="X Y [Z] …",
         ),
     ] = None,

@@ -34,8 +34,12 @@ class Around:
         self._tree = cKDTree(roadmap.points[vertices, : self._d].numpy())
 
     def weigh(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Ranks (N, K) of vertices among the resolved ones, the nearest first, their weights, and which points (N,)
-        lie near enough to one."""
+        """The vertices round points (N, width).
+
+        Returns:
+            Ranks (N, K) among the resolved ones, the nearest first, their weights (N, K), and which points (N,) lie
+            near enough to one.
+        """
         k = min(_NEIGHBOURS[self._d], self._count)
         # the one after the k-th is at infinity where there is none
         found = self._tree.query(points[:, : self._d].numpy(), k=range(1, k + 2))

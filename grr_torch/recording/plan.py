@@ -14,8 +14,8 @@ from grr_torch.recording import colours
 from grr_torch.recording.curves import curve_views, log_curves
 from grr_torch.recording.robot import RecordedRobot
 from grr_torch.recording.self_motion_view import in_space, line
-from grr_torch.resolution.slices import fullest_slice
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.slices import fullest_slice
 
 TIME = "plan"
 _DARK = (18, 20, 26)

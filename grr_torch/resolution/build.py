@@ -64,8 +64,8 @@ def build(
         seeds: (S, n) configurations that the expansion starts from, or "auto": they are found.
         candidates: How many sets of seeds are compared, where they are found; more take longer and may do better.
         method: "expansion", or "random": random configurations at every vertex and a constraint solver.
-        neighbours: How many of the nearest vertices are averaged over; 24 in the plane and 64 in space by default. Where
-            rotation varies, the vertices up to so many edges away, 2 by default.
+        neighbours: How many of the nearest vertices are averaged over; 24 in the plane and 64 in space by default.
+            Where rotation varies, the vertices up to so many edges away, 2 by default.
         samples: Random configurations of a vertex, for the method "random".
         refine: Whether the roadmap is repaired, relaxed and certified after the expansion.
         objectives: Weights of "clearance", "manipulability" and "limits", which refinement serves besides smoothness;

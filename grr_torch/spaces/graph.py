@@ -61,8 +61,8 @@ class TaskGraph:
     def neighbours(self, vertices: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """The k nearest other vertices of some vertices.
 
-        In a staggered grid, those as near as the k-th are among them, and what would lie beyond its border is not. Where
-        rotation varies, k counts edges instead: by D_p alone, many rotations at one place are nearer than any other.
+        In a staggered grid, those as near as the k-th are among them, and what would lie beyond its border is not.
+        Where rotation varies, k counts edges: by D_p alone, many rotations at one place are nearer than any other.
 
         Args:
             vertices: (F,) vertices.

@@ -60,7 +60,7 @@ def quaternion_from_matrix(rotation: Tensor) -> Tensor:
 
 
 def quaternion_distance(first: Tensor, second: Tensor) -> Tensor:
-    """D_SO(3) = 1 − |o_i · o_j| (*batch,) of unit quaternions (*batch, 4), as half the square of what is between them."""
+    """D_SO(3) = 1 − |o_i · o_j| (*batch,) of unit quaternions (*batch, 4), as ½ ‖o_i ∓ o_j‖²: exact for near ones."""
     return 0.5 * torch.minimum((first - second).square().sum(-1), (first + second).square().sum(-1))
 
 

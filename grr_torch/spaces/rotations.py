@@ -121,7 +121,7 @@ class Yaws(Rotations):
         return wrap(rows + angle * along) if abs(along) > 1.0 - 1e-9 else rows
 
     def grid(self, count: int) -> RotationGrid:
-        """A ring: 0, 2π / n, …"""
+        """A ring from 0 in steps of 2π / n."""
         count = _checked(count)
         values = wrap(torch.arange(count, dtype=torch.float64)[:, None] * (2.0 * math.pi / count))
         pairs = [(k, k + 1) for k in range(count - 1)] + ([(0, count - 1)] if count > 2 else [])
@@ -193,7 +193,7 @@ class Orientations(Rotations):
 
     def interpolate(self, start: Tensor, end: Tensor, fraction: float | Tensor) -> Tensor:
         """Slerp on the shorter arc."""
-        return slerp(*torch.broadcast_tensors(start, end), fraction)
+        return slerp(start, end, fraction)
 
     def centre(self, rows: Tensor) -> Tensor:
         """The direction of their sum, each with the sign that is nearer to the first."""
