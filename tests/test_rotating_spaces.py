@@ -227,6 +227,17 @@ def test_neighbours_are_those_so_many_edges_away_with_their_distances(task, coun
         assert near - {vertex} <= set(mine)
 
 
+@pytest.mark.parametrize(("task", "count"), [(Pose(2), 1), (Pose(2), 8), (Axis(3), 30), (Pose(3), 24)])
+def test_around_a_vertex_are_the_other_ends_of_its_edges(task, count):
+    graph = product_graph(task, staggered_grid([(0.0, 1.0)] * task.dimension, 40), count)
+    vertices = torch.arange(0, len(graph.points), 7).flip(0)
+    rank, others = graph.around(vertices)
+    expected = TaskGraph.around(graph, vertices)
+    assert torch.equal(rank, expected[0])
+    size = len(graph.points)
+    assert torch.equal((rank * size + others).sort().values, (expected[0] * size + expected[1]).sort().values)
+
+
 @pytest.mark.parametrize(("task", "count"), [(Pose(2), 8), (Axis(3), 30), (Pose(3), 24)])
 def test_the_nearest_vertices_are_those_by_the_metric(task, count):
     graph = product_graph(task, staggered_grid([(-1.0, 1.0)] * task.dimension, 60), count)

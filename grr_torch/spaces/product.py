@@ -66,6 +66,18 @@ class ProductGraph(TaskGraph):
             distances.append(total.flatten(1))
         return torch.cat(indices, dim=1), torch.cat(distances, dim=1)
 
+    def around(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """As of any graph, worked out from both: compressed rows of a large product would not fit."""
+        size = len(self.positions.points)
+        place, turn = vertices % size, vertices // size
+        rank, near = self.positions.around(place)
+        rings = self._ring(1)[0].to(vertices.device)[turn]
+        rows, columns = (rings >= 0).nonzero().unbind(1)
+        ranks = torch.cat([rank, rows])
+        others = torch.cat([turn[rank] * size + near, rings[rows, columns] * size + place[rows]])
+        order = ranks.argsort(stable=True)
+        return ranks[order], others[order]
+
     def _places(self, places: Tensor, hops: int, *, itself: bool) -> tuple[Tensor, Tensor]:
         """Positions (F, K) round others and how far they are [m], the position itself first if it is wanted."""
         found = [(places[:, None], torch.zeros_like(places[:, None], dtype=torch.float64))] if itself else []
