@@ -42,9 +42,9 @@ class Solution:
         configurations: (*batch, n) configurations; NaN where not valid.
         valid: (*batch,) bool: the tool is at the point, within limits and free of self-collision.
         status: (*batch,) array of text. Of valid ones: "solved", or "uncertified" in a cell inside which the map may
-            not be continuous (where rotation varies, at such a cell's corners, as far as cells were measured). Of others: "outside" the roadmap's bounds, "too far" from every resolved vertex, "not
-            converged", "off the map", where the projection ends in another posture than the vertices around have, or
-            in "self-collision".
+            not be continuous (where rotation varies, near a corner of such a cell, as far as cells were measured). Of
+            others: "outside" the roadmap's bounds, "too far" from every resolved vertex, "not converged", "off the
+            map", where the projection ends in another posture than the vertices around have, or in "self-collision".
     """
 
     configurations: Tensor
