@@ -16,8 +16,14 @@ from grr_torch.errors import ParameterError
 @reports_errors
 def build(
     robot: Annotated[str, typer.Option(help="A bundled robot (grr-torch robots) or the path of a URDF.")],
-    task: Annotated[str | None, typer.Option(help="position or fixed-rotation; the preset's default.")] = None,
+    task: Annotated[
+        str | None, typer.Option(help="position, fixed-rotation, yaw, axis or pose; the preset's default.")
+    ] = None,
     points: Annotated[int | None, typer.Option(help="Vertices that the staggered grid is asked for.")] = None,
+    rotations: Annotated[
+        int | None,
+        typer.Option(help="Rotations of the grid, where rotation varies: yaws, directions or orientations."),
+    ] = None,
     seeds: Annotated[
         str | None,
         typer.Option(
@@ -47,7 +53,12 @@ def build(
         int, typer.Option(help="Random starts per unresolved vertex, to tell which are reachable; 0: not measured.")
     ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
-    neighbours: Annotated[int | None, typer.Option(help="Nearest vertices averaged over; 24 or 64.")] = None,
+    neighbours: Annotated[
+        int | None,
+        typer.Option(
+            help="Nearest vertices averaged over; 24 or 64. Where rotation varies, those so many edges away; 2."
+        ),
+    ] = None,
     tool: Annotated[str | None, typer.Option(help="Link whose pose is controlled.")] = None,
     base: Annotated[str | None, typer.Option(help="Link in whose frame points are given.")] = None,
     bounds: Annotated[
@@ -56,8 +67,16 @@ def build(
     rotation: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
-            help="Fixed-axis roll, pitch, yaw of the tool in radians, for fixed-rotation; 0 0 0 without a preset.",
+            help="Fixed-axis roll, pitch, yaw of the tool in radians, for fixed-rotation, and for yaw at yaw 0; 0 0 0 "
+            "without a preset.",
             metavar="R P Y",
+        ),
+    ] = None,
+    axis: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="For yaw, what the tool turns about, in the base frame; for axis, the tool's axis, in its own; 0 0 1.",
+            metavar="X Y Z",
         ),
     ] = None,
     package_dir: Annotated[list[Path] | None, typer.Option(help="Folder for package:// meshes; repeatable.")] = None,
@@ -104,10 +123,11 @@ def build(
         box = None if bounds is None else _bounds(bounds)
         roadmap = build_roadmap(
             arm,
-            _task(arm, task, box, rotation),
+            _task(arm, task, box, rotation, axis),
             points=points,
             bounds=box,
             seeds=_seeds(arm, seeds),
+            rotations=rotations,
             candidates=CANDIDATES if candidates is None else candidates,
             method=method,
             samples=samples,
@@ -171,14 +191,18 @@ def _keep_inputs(out: Path, record: Path | None, inputs: Sequence[str | Path | N
 
 
 def _task(
-    arm: Any, kind: str | None, box: list[tuple[float, float]] | None, rotation: tuple[float, float, float] | None
+    arm: Any,
+    kind: str | None,
+    box: list[tuple[float, float]] | None,
+    rotation: tuple[float, float, float] | None,
+    axis: tuple[float, float, float] | None,
 ) -> Any:
     """The task space where the options say more than the preset does; else its kind."""
     from grr_torch.spaces.task import FixedRotation, make_task
 
     preset = arm.preset
     kind = kind or (preset.default_task if preset else "position" if rotation is None else FixedRotation.kind)
-    if rotation is None and preset is not None and kind in preset.problems and box is None:
+    if rotation is axis is None and preset is not None and kind in preset.problems and box is None:
         return kind
     problem = preset.problems.get(kind) if preset else None
     sides = box or (problem.bounds if problem else None)
@@ -186,7 +210,7 @@ def _task(
         return kind
     if rotation is None and problem is not None and len(problem.bounds) == len(sides):
         rotation = problem.rotation
-    return make_task(kind, len(sides), rotation)
+    return make_task(kind, len(sides), rotation, axis)
 
 
 def _bounds(text: str) -> list[tuple[float, float]]:

@@ -79,6 +79,7 @@ def info(
         rows = [
             ("robot", f"{robot.name}, {robot.n} joints, {robot.base} → {robot.tool}"),
             ("task", roadmap.task.name + ("" if rotation is None else f", roll pitch yaw {rotation} rad")),
+            *_turning(roadmap),
             (
                 "self-collision model",
                 f"{sum(map(len, spheres.spheres.values()))} spheres, {len(spheres.checked)} pairs of links, "
@@ -102,6 +103,18 @@ def info(
         failed = ", ".join(check.name for check in checks if not check.passed)
         typer.secho(f"error: {file} is not consistent with itself: {failed}", err=True, fg=typer.colors.RED)
         raise typer.Exit(2)
+
+
+def _turning(roadmap: Roadmap) -> list[tuple[str, str]]:
+    """What the grid of rotations is, where rotation varies."""
+    from grr_torch.spaces.product import ProductGraph
+
+    graph = roadmap.graph
+    if not isinstance(graph, ProductGraph):
+        return []
+    d = roadmap.task.dimension
+    places, turns = len(graph.positions.points), len(graph.rotations.values)
+    return [("grid", f"{places:,} positions × {turns:,} rotations ({', '.join(roadmap.task.coordinates[d:])})")]
 
 
 def _steep_rows(roadmap: Roadmap, edges: Tensor) -> list[tuple[str, str]]:

@@ -19,8 +19,10 @@ if TYPE_CHECKING:
 @reports_errors
 def plan(
     file: Annotated[FilePath, typer.Argument(help="A roadmap file.", metavar="FILE.grr")],
-    start: Annotated[str | None, typer.Option(help="Where the tool starts, in metres.", metavar="X Y [Z]")] = None,
-    goal: Annotated[str | None, typer.Option(help="Where the tool is to go, in metres.", metavar="X Y [Z]")] = None,
+    start: Annotated[str | None, typer.Option(help="Where the tool starts, as for solve.", metavar="X Y [Z] …")] = None,
+    goal: Annotated[
+        str | None, typer.Option(help="Where the tool is to go, as for solve.", metavar="X Y [Z] …")
+    ] = None,
     start_configuration: Annotated[
         str | None, typer.Option(help="Where the arm starts, in radians or metres; on the map or off it.", metavar="Q…")
     ] = None,
@@ -49,7 +51,7 @@ def plan(
     from grr_torch.output import atomic_write, check_writable
     from grr_torch.recording.plan import record_plan
     from grr_torch.resolution.roadmap import Roadmap
-    from grr_torch.tables import AXES, check_suffix
+    from grr_torch.tables import check_suffix
 
     _check_files(file, out, record)
     if out is not None:
@@ -58,7 +60,7 @@ def plan(
         if target is not None:
             check_writable(target)
     roadmap = Roadmap.load(file)
-    axes, joints = AXES[: roadmap.task.width], roadmap.robot.joint_names
+    axes, joints = roadmap.task.coordinates, roadmap.robot.joint_names
     path = roadmap.plan(
         _tensor("--start", start, axes),
         _tensor("--goal", goal, axes),

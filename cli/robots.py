@@ -33,5 +33,6 @@ def robots(
         typer.echo(f"  tool {preset.tool}, base {preset.base}")
         for kind, problem in preset.problems.items():
             bounds = " × ".join(f"[{low:g}, {high:g}]" for low, high in problem.bounds)
+            turns = f" × {problem.rotations} rotations" if problem.rotations else ""
             default = " (default)" if kind == preset.default_task else ""
-            typer.echo(f"  {kind}{default}: {problem.points:,} points in {bounds} m, {len(problem.seeds)} seeds")
+            typer.echo(f"  {kind}{default}: {problem.points:,} points{turns} in {bounds} m, {len(problem.seeds)} seeds")

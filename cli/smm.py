@@ -33,10 +33,12 @@ def smm(
         typer.Option(
             help="Point of the task space in metres; repeatable: all are drawn together. None: three neighbouring "
             "vertices of the roadmap.",
-            metavar="X Y [Z]",
+            metavar="X Y [Z] …",
         ),
     ] = None,
-    task: Annotated[str | None, typer.Option(help="position or fixed-rotation; the preset's default.")] = None,
+    task: Annotated[
+        str | None, typer.Option(help="position, fixed-rotation, yaw, axis or pose; the preset's default.")
+    ] = None,
     rotation: Annotated[
         tuple[float, float, float] | None,
         typer.Option(help="Fixed-axis roll, pitch, yaw of the tool in radians; the preset's.", metavar="R P Y"),
@@ -139,9 +141,10 @@ def _triangle(graph: Roadmap) -> list[list[float]]:
     corners = graph.cells()[0].corners
     if len(corners) == 0:
         raise ParameterError("--point", "nothing", "a point: the roadmap has no three vertices that are all joined")
-    middle = graph.points[graph.resolved].mean(0)
-    away = graph.points[corners].mean(1) - middle
-    radius = (graph.points[graph.resolved] - middle).norm(dim=1).max()
+    places = graph.positions
+    middle = places[graph.resolved].mean(0)
+    away = places[corners].mean(1) - middle
+    radius = (places[graph.resolved] - middle).norm(dim=1).max()
     wanted = radius * torch.nn.functional.normalize(torch.ones_like(middle), dim=0) / 1.5
     triangle: list[list[float]] = graph.points[corners[(away - wanted).norm(dim=1).argmin()]].tolist()
     return triangle
@@ -152,8 +155,9 @@ def _numbers(text: str) -> list[float]:
         numbers = [float(value) for value in text.replace(",", " ").split()]
     except ValueError:
         numbers = []
-    if len(numbers) not in (2, 3):
-        raise ParameterError("--point", repr(text), "two or three numbers: x y [z]")
+    if len(numbers) not in (2, 3, 4, 6, 7):
+        valid = "two or three numbers, x y [z], and where rotation varies yaw, ax ay az or qw qx qy qz after them"
+        raise ParameterError("--point", repr(text), valid)
     return numbers
 
 
@@ -161,11 +165,12 @@ def _task(
     arm: Robot | None, places: list[list[float]], kind: str | None, rotation: tuple[float, float, float] | None
 ) -> TaskSpace:
     """The task space that the options ask for, with the preset's rotation where none is given."""
-    from grr_torch.spaces.task import FixedRotation, make_task
+    from grr_torch.spaces.task import FixedRotation, Pose, make_task
 
     preset = arm.preset if arm else None
     kind = kind or (FixedRotation.kind if rotation else preset.default_task if preset else "position")
-    dimension = len(places[0])
+    # x y yaw is a pose in the plane
+    dimension = 2 if len(places[0]) == 2 or (len(places[0]) == 3 and kind == Pose.kind) else 3
     problem = preset.problems.get(kind) if preset else None
     if rotation is None and problem is not None and len(problem.bounds) == dimension:
         rotation = problem.rotation

@@ -21,11 +21,17 @@ def solve(
     file: Annotated[Path, typer.Argument(help="A roadmap file.", metavar="FILE.grr")],
     point: Annotated[
         list[str] | None,
-        typer.Option(help="Point of the task space in metres; repeatable.", metavar="X Y [Z]"),
+        typer.Option(
+            help="Point of the task space in metres; repeatable. Where rotation varies, a yaw in radians, a direction, "
+            "or a quaternion W X Y Z follows.",
+            metavar="X Y [Z] …",
+        ),
     ] = None,
     points: Annotated[
         Path | None,
-        typer.Option(help="Points, one a row: .csv, .npy or .parquet; of columns, those named x, y, z."),
+        typer.Option(
+            help="Points, one a row: .csv, .npy or .parquet; of columns, those named x, y, z (yaw, ax …, qw …)."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -46,7 +52,7 @@ def solve(
     from grr_torch.applications.solve_table import solve_table
     from grr_torch.output import check_writable
     from grr_torch.resolution.roadmap import Roadmap
-    from grr_torch.tables import AXES, check_suffix, read_points
+    from grr_torch.tables import check_suffix, read_points
 
     if (points is None) == (not point):
         raise ParameterError("--point and --points", "both" if point else "neither", "one of them")
@@ -58,14 +64,14 @@ def solve(
             raise ParameterError("--out", out, "another file than those that are read")
         check_writable(out)
     roadmap = Roadmap.load(file)
-    width = roadmap.task.width
-    places = np.array([numbers("--point", text, AXES[:width]) for text in point or []]).reshape(-1, width)
+    width, axes = roadmap.task.width, roadmap.task.coordinates
+    places = np.array([numbers("--point", text, axes) for text in point or []]).reshape(-1, width)
     counts = {}
     if out is not None:
         with progress_bar() as progress:
             # read twice: what is wrong with the file is said before the work starts
-            count = len(places) if points is None else sum(map(len, read_points(points, width)))
-            pieces = [places] if points is None else read_points(points, width)
+            count = len(places) if points is None else sum(map(len, read_points(points, width, axes)))
+            pieces = [places] if points is None else read_points(points, width, axes)
             counts = solve_table(roadmap, pieces, count, out, progress=progress)
     _show(roadmap, places, counts, out, as_json)
 

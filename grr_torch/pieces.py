@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any, TypeAlias
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+# what a few columns are worked on in
+Array: TypeAlias = NDArray[Any]
 
 # configurations worked on together: few enough for the cache, enough that a torch call costs less than its arithmetic
 _ON_CPU = 3500

@@ -39,11 +39,16 @@ def check_suffix(name: str, path: Path, *, read: bool = False) -> None:
         raise ParameterError(name, path, f"a file that ends in {', '.join(known)}")
 
 
-def read_points(path: Path, width: int) -> Iterator[Array]:
+def read_points(path: Path, width: int, axes: Sequence[str] = AXES) -> Iterator[Array]:
     """Points of a file in pieces (N, width), finite, float64.
 
-    A .csv may have a header. Columns named x, y (and z) are taken where there are such; else there must be as many
-    columns as coordinates.
+    A .csv may have a header. Columns named like the coordinates are taken where there are such; else there must be as
+    many columns as coordinates.
+
+    Args:
+        path: The file.
+        width: How many coordinates a point has.
+        axes: Their names.
 
     Raises:
         ParameterError: The suffix is not known.
@@ -55,7 +60,7 @@ def read_points(path: Path, width: int) -> Iterator[Array]:
     reader = {".csv": _read_csv, ".npy": _read_npy, ".parquet": _read_parquet}[path.suffix.lower()]
     rows = 0
     try:
-        for piece in reader(path, width):
+        for piece in reader(path, axes[:width]):
             bad = np.flatnonzero(~np.isfinite(piece).all(1))
             if len(bad):
                 raise FileFormatError(path, f"row {rows + int(bad[0]) + 1} holds NaN, infinite or missing values")
@@ -112,17 +117,16 @@ def unique_names(joints: Sequence[str], taken: Iterable[str]) -> list[str]:
     return [f"joint {name}" for name in joints] if set(joints) & set(taken) else list(joints)
 
 
-def _wanted(path: Path, names: Sequence[str], width: int) -> list[str]:
+def _wanted(path: Path, names: Sequence[str], axes: Sequence[str]) -> list[str]:
     """The columns that are a point's coordinates."""
-    axes = list(AXES[:width])
     if set(axes) <= set(names):
-        return axes
-    if len(names) != width:
-        raise FileFormatError(path, f"has {len(names)} columns; valid: {width}, or columns named {', '.join(axes)}")
+        return list(axes)
+    if len(names) != len(axes):
+        raise FileFormatError(path, f"has {len(names)} columns; valid: {len(axes)}, or columns named {', '.join(axes)}")
     return list(names)
 
 
-def _read_csv(path: Path, width: int) -> Iterator[Array]:
+def _read_csv(path: Path, axes: Sequence[str]) -> Iterator[Array]:
     from pyarrow import csv, float64
 
     with path.open(encoding="utf-8-sig") as file:
@@ -133,7 +137,7 @@ def _read_csv(path: Path, width: int) -> Iterator[Array]:
     cells = [cell.strip() for cell in next(csv_rows([first], delimiter=delimiter))]
     header = not all(map(_is_number, cells))
     names = cells if header else [str(k) for k in range(len(cells))]
-    wanted = _wanted(path, names, width)
+    wanted = _wanted(path, names, axes)
     reader = csv.open_csv(
         path,
         # a header is skipped, so that names are those that were found here
@@ -145,11 +149,11 @@ def _read_csv(path: Path, width: int) -> Iterator[Array]:
         yield np.column_stack([column.to_numpy(zero_copy_only=False) for column in batch.columns])
 
 
-def _read_parquet(path: Path, width: int) -> Iterator[Array]:
+def _read_parquet(path: Path, axes: Sequence[str]) -> Iterator[Array]:
     from pyarrow import parquet, types
 
     file = parquet.ParquetFile(path)
-    wanted = _wanted(path, file.schema_arrow.names, width)
+    wanted = _wanted(path, file.schema_arrow.names, axes)
     for name in wanted:
         kind = file.schema_arrow.field(name).type
         if not (types.is_floating(kind) or types.is_integer(kind)):
@@ -159,15 +163,15 @@ def _read_parquet(path: Path, width: int) -> Iterator[Array]:
         yield np.column_stack(columns).astype(np.float64)
 
 
-def _read_npy(path: Path, width: int) -> Iterator[Array]:
+def _read_npy(path: Path, axes: Sequence[str]) -> Iterator[Array]:
     table = np.load(path, mmap_mode="r", allow_pickle=False)
     names = table.dtype.names
     wanted = None
     if names is not None and table.ndim == 1:
-        wanted = _wanted(path, names, width)
-    elif table.dtype.kind not in "fiu" or table.ndim != 2 or table.shape[1] != width:
+        wanted = _wanted(path, names, axes)
+    elif table.dtype.kind not in "fiu" or table.ndim != 2 or table.shape[1] != len(axes):
         kind = f"shape {table.shape} of {table.dtype}"
-        raise FileFormatError(path, f"holds an array of {kind}; valid: (N, {width}), numbers")
+        raise FileFormatError(path, f"holds an array of {kind}; valid: (N, {len(axes)}), numbers")
     for start in range(0, len(table), PIECE):
         piece = table[start : start + PIECE]
         columns = piece if wanted is None else np.column_stack([piece[name] for name in wanted])

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import grr_torch
-from grr_torch.resolution.cells import triangles
 from grr_torch.resolution.quality import edge_slopes, steep_edges
+from grr_torch.spaces.cliques import triangles
 from grr_torch.spaces.graph import TaskGraph, find_lattice, staggered_grid
 
 

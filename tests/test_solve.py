@@ -7,7 +7,7 @@ import torch
 import grr_torch
 from grr_torch.applications.solve import STATUSES
 from grr_torch.errors import ParameterError
-from grr_torch.resolution.cells import triangles
+from grr_torch.spaces.cliques import triangles
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from grr_torch.spaces.rotation import (
     rotation_error,
     slerp,
 )
-from grr_torch.spaces.task import FixedRotation, Position, make_task, task_from_json
+from grr_torch.spaces.task import Axis, FixedRotation, Pose, Position, Yaw, make_task, task_from_json
 
 CONTINUOUS = torch.tensor([True, False, True])
 angles = stnp.arrays(np.float64, 3, elements=st.floats(-20.0, 20.0))
@@ -132,27 +132,9 @@ def test_task_distance_is_the_paper_s_metric(batch):
         torch.testing.assert_close(task.interpolate(a, b, 0.5), 0.5 * (a + b))
 
 
-class Pose(Position):
-    """A space in which rotation varies, to test that the base class carries it: rows of position and quaternion."""
-
-    def quaternions(self, points):
-        return points[..., 3:]
-
-
-def test_a_space_of_poses_joins_without_a_rewrite():
-    a, b = (torch.from_numpy(np.hstack([[[0.0, 0, 0]], rotations(1, k).as_quat(scalar_first=True)])) for k in (7, 8))
-    b[0, :3] = torch.tensor([0.0, 3.0, 4.0])
-    cosine = abs(float(a[0, 3:] @ b[0, 3:]))
-    assert float(Pose(3).distance(a, b)) == pytest.approx(5.0 + 0.3 * (1.0 - cosine))
-    middle = Pose(3).interpolate(a, b, 0.5)
-    assert middle[0, :3].tolist() == [0.0, 1.5, 2.0]
-    torch.testing.assert_close(
-        quaternion_distance(middle[:, 3:], a[:, 3:]), quaternion_distance(middle[:, 3:], b[:, 3:])
-    )
-
-
 def test_tasks_survive_json():
-    for task in (Position(2), Position(3), FixedRotation(2, (0, 0, 1.0)), FixedRotation(3, (1.0, 2.0, 3.0))):
+    fixed = (Position(2), Position(3), FixedRotation(2, (0, 0, 1.0)), FixedRotation(3, (1.0, 2.0, 3.0)))
+    for task in (*fixed, Pose(2), Pose(3), Yaw(3, (0.0, 2.0, 0.0), (1.0, 0, 0)), Axis(3, (1.0, 0.0, 0.0))):
         assert task_from_json(task.to_json()) == task
 
 

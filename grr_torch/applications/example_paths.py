@@ -8,6 +8,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from grr_torch.applications.teleoperate import check_teleoperable
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.spaces.configuration import difference
@@ -31,8 +32,9 @@ def middles(roadmap: Roadmap, count: int = 1) -> Tensor:
     deep ones, the first is nearest to the mean of all.
 
     Raises:
-        ParameterError: No vertex is resolved.
+        ParameterError: No vertex is resolved, or rotation varies.
     """
+    check_teleoperable(roadmap.task)
     points = roadmap.points
     doubtful = ~roadmap.resolved
     for corners in roadmap.uncertified:

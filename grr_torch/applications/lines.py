@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from grr_torch.pieces import Array
 from grr_torch.projection.continuity import continuous_columns
 from grr_torch.projection.project import Tolerances, project_columns
-from grr_torch.robots.few_kinematics import Array
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace
 

@@ -16,7 +16,7 @@ from grr_torch.applications.retime import retime
 from grr_torch.applications.ways import Way, substeps
 from grr_torch.errors import ParameterError
 from grr_torch.spaces.configuration import difference, distance
-from grr_torch.tables import AXES, table_writer, unique_names
+from grr_torch.tables import table_writer, unique_names
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -39,6 +39,7 @@ class Path:
             waypoints; a configuration's way to the map does not count where it is straight in joint space.
         mean_deviation: Its mean.
         reason: Why there is no path; empty if there is one.
+        dimension: How many of a point's entries, the first ones, are its position.
     """
 
     points: Tensor
@@ -48,6 +49,7 @@ class Path:
     max_deviation: float
     mean_deviation: float
     reason: str = ""
+    dimension: int = 3
 
     @property
     def found(self) -> bool:
@@ -62,7 +64,7 @@ class Path:
     @property
     def task_length(self) -> float:
         """Length of the tool's way [m]."""
-        return float(self.points.diff(dim=0).norm(dim=1).sum()) if self.found else math.nan
+        return float(self.points[:, : self.dimension].diff(dim=0).norm(dim=1).sum()) if self.found else math.nan
 
     @property
     def joint_length(self) -> float:
@@ -75,7 +77,8 @@ def path_of(roadmap: Roadmap, ways: list[Way], velocity_limits: Tensor, accelera
     points, q = _joined(ways, roadmap.robot.continuous)
     largest, mean = _deviation(roadmap, ways)
     times = retime(q.cpu(), velocity_limits, acceleration_limits)
-    return Path(points.cpu(), q.cpu(), times, _passed(roadmap, ways), largest, mean)
+    passed = _passed(roadmap, ways)
+    return Path(points.cpu(), q.cpu(), times, passed, largest, mean, dimension=roadmap.task.dimension)
 
 
 def save_path(roadmap: Roadmap, path: Path, file: str | os.PathLike[str]) -> None:
@@ -87,7 +90,7 @@ def save_path(roadmap: Roadmap, path: Path, file: str | os.PathLike[str]) -> Non
     """
     if not path.found:
         raise ParameterError("path", path.reason, "one that was found")
-    axes = AXES[: roadmap.task.width]
+    axes = roadmap.task.coordinates
     joints = unique_names(roadmap.robot.joint_names, (*axes, "time"))
     columns = {"times": ["time"], "points": axes, "configurations": joints}
     constants = {"vertices": path.vertices.numpy(), "joint_names": np.array(roadmap.robot.joint_names)}
@@ -133,4 +136,4 @@ def _passed(roadmap: Roadmap, ways: list[Way]) -> Tensor:
     points = torch.stack([ways[0].points[0], *(way.points[-1] for way in ways)]).cpu()
     nearest = roadmap.solver.nearest(points)[1][:, 0]
     there = distance(roadmap.configurations[nearest], ends, roadmap.robot.continuous.cpu()) <= _SAME
-    return torch.unique_consecutive(nearest[there & ((roadmap.points[nearest] - points).norm(dim=1) <= _SAME)])
+    return torch.unique_consecutive(nearest[there & (roadmap.task.distance(roadmap.points[nearest], points) <= _SAME)])

@@ -16,7 +16,7 @@ from grr_torch.applications.shorten import shorten
 from grr_torch.applications.ways import Stops, Way, WayFinder
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
-from grr_torch.projection.project import point_columns
+from grr_torch.projection.project import point_columns, tool_points
 from grr_torch.spaces.configuration import distance
 
 if TYPE_CHECKING:
@@ -96,12 +96,11 @@ class Planner:
             return _Refusal(f"the {name} configuration is beyond joint limits")
         if bool(robot.in_self_collision(q)):
             return _Refusal(f"the {name} configuration is in self-collision")
-        position, _ = robot.forward_kinematics(q)
-        return _End(Stops(position[:, : self.task.width], q, torch.tensor([-1])), measured=True)
+        return _End(Stops(tool_points(robot, self.task, q), q, torch.tensor([-1])), measured=True)
 
     def ways_between(self, start: _End, goal: _End, smooth: bool) -> list[Way] | _Refusal:
         """Ways from start to goal, one after the other, or why there are none."""
-        near = (start.stop.points - goal.stop.points).norm() <= self.roadmap.solver.radius
+        near = self.task.distance(start.stop.points, goal.stop.points) <= self.roadmap.solver.radius
         direct = self.ways.on_map(start.stop, goal.stop)[0] if bool(near) else None
         if direct is not None:
             return [direct]

@@ -90,7 +90,7 @@ class Sampler:
 
     def _random_steps(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """From each q (n, N) a step in a random direction along the manifold, projected (n, N), and valid (N,)."""
-        jacobian = self.task.jacobian(self.robot.tree.jacobian(self.robot.tree.frames(q)))
+        jacobian = self.task.jacobian(self.robot.tree.jacobian(self.robot.tree.frames(q)), self.target)
         projector = null_space_projector(jacobian, 1e3 * torch.finfo(q.dtype).eps)
         noise = torch.randn(*q.shape, dtype=q.dtype, generator=self.generator).to(q.device)
         motion = (projector * noise).sum(1)

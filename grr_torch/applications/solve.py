@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from grr_torch.applications.around import Around, AroundProduct
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress, silent
@@ -29,14 +29,8 @@ _SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_C
 
 # points worked on together
 _AT_ONCE = 1 << 12
-# a guess averages over so many vertices, in the plane and in space: a grid's first two shells
-_NEIGHBOURS = {2: 8, 3: 14}
-# of so many points the neighbours are searched for on all processors
-_MANY = 1000
 # the most vertices of which a matrix of neighbours is made: 16 MiB
 _MATRIX = 4096
-# no vertex farther than so many of the longest edges counts, and one must lie within one of them
-_FARTHEST = 1.5
 # radians of self-motion from the average beyond which a configuration is none of the map's
 _OFF_MAP = 0.5
 
@@ -49,10 +43,11 @@ class Solution:
         configurations: (*batch, n) configurations; NaN where not valid.
         valid: (*batch,) bool: the tool is at the point, within limits and free of self-collision.
         status: (*batch,) array of text. Of valid ones: "solved", or "uncertified" in a cell inside which the map may
-            not be continuous. Of others: "outside" the roadmap's bounds, "too far" from every resolved vertex, "not
-            converged", "off the map", where the projection ends in another posture than the vertices around have, or
-            in "self-collision"; and of the differentiable map, "no cell" where a corner of the cell is not resolved or
-            an edge of it is broken.
+            not be continuous (where rotation varies, near a corner of such a cell, as far as cells were measured). Of
+            others: "outside" the roadmap's bounds, "too far" from every resolved vertex, "not converged", "off the
+            map", where the projection ends in another posture than the vertices around have, or in "self-collision";
+            and of the differentiable map, "no cell" where a corner of the cell is not resolved or an edge of it is
+            broken.
     """
 
     configurations: Tensor
@@ -86,12 +81,14 @@ class Solver:
         self._low, self._high = self.low.numpy() - slack, points.amax(0).numpy() + slack
         lengths = (points[roadmap.edges[:, 0]] - points[roadmap.edges[:, 1]]).norm(dim=1)
         self.radius = float(lengths.max()) if len(lengths) else math.inf
-        self._tree = cKDTree(points[vertices].numpy())
+        turning = self.task.rotations is not None
+        self._around = (AroundProduct if turning else Around)(roadmap, vertices, self.radius)
         self._continuous = self.robot.continuous.cpu()
         self._embedded = embed(roadmap.configurations[vertices], self._continuous)
         ends = _neighbour_table(roadmap, vertices)
         self._ends = ends.numpy()
         self._joined = _neighbour_matrix(ends).numpy() if len(vertices) <= _MATRIX else None
+        # where rotation varies, suspects are looked up by their nearest vertices
         self._lattice = roadmap.graph.lattice
         self._suspect = self._uncertified_places(roadmap)
         if self._suspect is not None:
@@ -148,22 +145,14 @@ class Solver:
         2n multiply-adds a neighbour, and k³ a doubling of the paths by which connected vertices are found.
         """
         positions = points[:, : self.task.dimension].numpy()
-        k = min(_NEIGHBOURS[self.task.dimension], len(self.vertices))
-        # the one after the k-th is at infinity where there is none
-        distances, nearest = self._tree.query(positions, k + 1, workers=-1 if len(points) > _MANY else 1)
-        near, nearest = np.maximum(distances[:, :k], 1e-12), nearest[:, :k]
-        if math.isfinite(self.radius):
-            reach = np.minimum(distances[:, k:], _FARTHEST * self.radius)
-            weights = np.square(np.maximum(reach / near - 1.0, 0.0))
-        else:
-            weights = 1.0 / np.square(near)
-        weights *= self._largest_part(nearest)
+        nearest, weights, near = self._around.weigh(points)
+        weights = weights * self._largest_part(nearest, weights > 0.0)
         sums = embedding_bag(
             torch.from_numpy(nearest), self._embedded, per_sample_weights=torch.from_numpy(weights), mode="sum"
         )
         codes = np.full(len(points), _SOLVED, dtype=np.uint8)
         self._mark_uncertified(codes, positions, nearest[:, 0])
-        codes[(distances[:, 0] > self.radius) | ~(weights.sum(1) > 0.0)] = _TOO_FAR
+        codes[~near | ~(weights.sum(1) > 0.0)] = _TOO_FAR
         codes[((positions < self._low) | (positions > self._high)).any(1)] = _OUTSIDE
         return average(sums, self._continuous), torch.from_numpy(codes)
 
@@ -179,7 +168,9 @@ class Solver:
         result = lengths.isfinite()
         if len(far):
             columns = motion[far].T
-            jacobian = self.task.jacobian(self.robot.tree.jacobian(self.robot.tree.frames(q[far].T.contiguous())))
+            frames = self.robot.tree.frames(q[far].T.contiguous())
+            points = self.task.at(*self.robot.tree.tool_pose(frames))
+            jacobian = self.task.jacobian(self.robot.tree.jacobian(frames), points)
             moved = (jacobian * columns).sum(1)
             across = damped_least_squares(jacobian, moved, torch.full_like(moved[0], 1e-6))
             result[far] &= (columns - across).norm(dim=0) <= _OFF_MAP
@@ -187,14 +178,13 @@ class Solver:
 
     def nearest(self, points: Tensor, k: int = 1) -> tuple[Tensor, Tensor]:
         """The k nearest resolved vertices of points (N, width) on the CPU: distances (N, k) and vertices (N, k)."""
-        positions = points[:, : self.task.dimension].numpy()
-        distances, index = self._tree.query(positions, k=range(1, min(k, len(self.vertices)) + 1))
-        return torch.from_numpy(distances), self.vertices[torch.from_numpy(index)]
+        distances, index = self._around.nearest(points, k)
+        return distances, self.vertices[index]
 
-    def _largest_part(self, nearest: NDArray[Any]) -> NDArray[np.bool_]:
+    def _largest_part(self, nearest: NDArray[Any], counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which of the vertices (N, k) lie in the largest part connected by edges among them; the nearest of equals.
 
-        A set of them is a number: vertex j is its bit j.
+        Only those that count (N, k) do. A set of them is a number: vertex j is its bit j.
         """
         k = nearest.shape[1]
         if self._joined is not None:
@@ -202,13 +192,14 @@ class Solver:
         else:
             joined = (self._ends[nearest][..., None] == nearest[:, None, None, :]).any(2)
         bits = 1 << np.arange(k)
-        around = joined @ bits | bits
+        counted = counts @ bits
+        around = np.where(counts, (joined @ bits | bits) & counted[:, None], 0)
         # most points have all of them in one part: what the first is joined to, and so on
         part, before = around[:, 0], around[:, 0] * 0
         while (part != before).any():
             before = part
             part = np.bitwise_or.reduce(np.where(part[:, None] & bits, around, 0), axis=1)
-        left = (part != (1 << k) - 1).nonzero()[0]
+        left = (part != counted).nonzero()[0]
         if len(left):
             # Warshall's closure: whoever is joined to j is joined to all that j is joined to
             closed = around[left]
@@ -234,11 +225,11 @@ class Solver:
         Such a point lies within the longest edge of a corner of its cell, and its nearest vertex is no farther.
         """
         corners = torch.cat([cells.reshape(-1) for cells in roadmap.uncertified]).unique()
-        if self._lattice is None:
+        if not isinstance(self._around, Around) or self._lattice is None:
             return np.isin(self.vertices.numpy(), corners.numpy())
         places = roadmap.points[corners, : self.task.dimension].numpy()
         marked = np.zeros(len(self.vertices), dtype=bool)
-        for found in self._tree.query_ball_point(places, 2.0 * self.radius + 1e-9):
+        for found in self._around.within(places, 2.0 * self.radius + 1e-9):
             marked[found] = True
         return marked
 

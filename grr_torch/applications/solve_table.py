@@ -11,7 +11,7 @@ import torch
 
 from grr_torch.applications.solve import STATUSES
 from grr_torch.progress import Progress, silent
-from grr_torch.tables import AXES, Array, table_writer, unique_names
+from grr_torch.tables import Array, table_writer, unique_names
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -36,7 +36,7 @@ def solve_table(
         ParameterError: The suffix is not known, or points are not valid.
         OutputError: It cannot be written.
     """
-    axes = AXES[: roadmap.task.width]
+    axes = roadmap.task.coordinates
     columns = {
         "points": axes,
         "configurations": unique_names(roadmap.robot.joint_names, (*axes, "valid", "status")),

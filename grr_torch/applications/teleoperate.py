@@ -18,6 +18,7 @@ from grr_torch.applications.routes import Routes
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
 from grr_torch.projection.project import Tolerances
+from grr_torch.spaces.task import TaskSpace
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -42,6 +43,16 @@ class Command:
 
     configuration: Tensor
     status: np.ndarray[Any, np.dtype[np.str_]]
+
+
+def check_teleoperable(task: TaskSpace) -> None:
+    """Checks that arms can be teleoperated in a task space.
+
+    Raises:
+        ParameterError: Rotation varies in it.
+    """
+    if task.rotations is not None:
+        raise ParameterError("task", task.kind, "position or fixed-rotation: rotation is not teleoperated")
 
 
 class Teleoperator:
@@ -81,9 +92,10 @@ class Teleoperator:
             timeout: An input older than this [s] is refused; see `step`.
 
         Raises:
-            ParameterError: A parameter is out of its range, or no vertex is resolved.
+            ParameterError: A parameter is out of its range, no vertex is resolved, or rotation varies in the task.
         """
         robot = roadmap.robot
+        check_teleoperable(roadmap.task)
         if not 0.0 < rate < math.inf:
             raise ParameterError("rate", rate, "above 0, in Hz")
         for name, value in (("max_jump", max_jump), ("timeout", timeout)):

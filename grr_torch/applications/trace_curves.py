@@ -223,7 +223,7 @@ class Tracer:
 
     def _tangents(self, q: Tensor, like: Tensor) -> Tensor:
         """Unit null vectors (n, N) of the Jacobians at q (n, N), in the sense of `like` (n, N)."""
-        jacobian = self.task.jacobian(self.robot.tree.jacobian(self.robot.tree.frames(q)))
+        jacobian = self.task.jacobian(self.robot.tree.jacobian(self.robot.tree.frames(q)), self.target)
         projector = null_space_projector(jacobian, 1e3 * torch.finfo(q.dtype).eps)
         tangents = (projector * like).sum(1)
         return tangents / tangents.norm(dim=0)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from grr_torch.applications.lines import SUBSTEPS
 from grr_torch.applications.solve import Solver
-from grr_torch.projection.project import project_columns
+from grr_torch.projection.project import project_columns, tool_points
 from grr_torch.spaces.configuration import difference, distance, interpolate
 
 # bisections after which a line whose configurations are still apart is given up, and pieces
@@ -117,8 +117,7 @@ class WayFinder:
 
         def middle(pa: Tensor, pb: Tensor, qa: Tensor, qb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             q = interpolate(qa, qb, 0.5, wraps)
-            position, _ = robot.forward_kinematics(q.T)
-            return position[:, : len(pa)].T, q, ~robot.columns_in_self_collision(q)
+            return tool_points(robot, self.solver.task, q.T).T, q, ~robot.columns_in_self_collision(q)
 
         return self._ways(starts, ends, middle, straight=False)
 
@@ -143,7 +142,8 @@ class WayFinder:
         rows = [(way, low, columns[0], columns[2]), (way, high, columns[1], columns[3])]
         for _ in range(_DEPTH):
             pa, pb, qa, qb = columns
-            long = (difference(qa, qb, wraps).norm(dim=0) >= self.step) | ((pb - pa).norm(dim=0) > self._spacing)
+            far = (pb - pa)[: self.solver.task.dimension].norm(dim=0) > self._spacing
+            long = (difference(qa, qb, wraps).norm(dim=0) >= self.step) | far
             left = (long & found[way]).nonzero()[:, 0]
             if len(left) == 0:
                 break

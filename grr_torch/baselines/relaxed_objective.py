@@ -149,7 +149,7 @@ class RelaxedObjective:
         weights = self._weights
         frames = self._robot.tree.frames(q)
         error = self._task.error(targets, *self._robot.tree.tool_pose(frames))
-        jacobian = self._task.jacobian(self._robot.tree.jacobian(frames))
+        jacobian = self._task.jacobian(self._robot.tree.jacobian(frames), targets)
         rows = self._task.dimension
         yield _Goal(weights.position, error[:rows], -jacobian[:rows])
         if len(error) > rows:

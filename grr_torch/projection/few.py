@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from grr_torch.pieces import Array
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.step import (
     DAMPING,
@@ -25,7 +26,6 @@ from grr_torch.projection.step import (
     nudge,
     stop_at_limits,
 )
-from grr_torch.robots.few_kinematics import Array
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace
 
@@ -63,7 +63,7 @@ def converge_few(
                 break
             rank, best, before, size, now = rank[kept], best[kept], before[kept], size[kept], now[:, kept]
             error, frames, wanted = error[:, kept], frames[..., kept], wanted[:, kept]
-        jacobian = task.jacobian(torch.from_numpy(few.jacobian(frames))).numpy()
+        jacobian = task.jacobian(torch.from_numpy(few.jacobian(frames)), torch.from_numpy(wanted)).numpy()
         jacobian[task.dimension :] *= ROTATION_LENGTH
         error[task.dimension :] *= ROTATION_LENGTH
         now = _step(limits, now, jacobian, error, 0.5 * DAMPING * size + LEAST_DAMPING)

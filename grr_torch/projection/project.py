@@ -99,7 +99,7 @@ def point_columns(robot: Robot, task: TaskSpace, points: Tensor) -> Tensor:
     """Points (*batch, width) as finite columns (width, N) in the robot's dtype.
 
     Raises:
-        ParameterError: The width is not the task's, or a value is not finite.
+        ParameterError: The width is not the task's, a value is not finite, or a direction or quaternion is zero.
     """
     if not isinstance(points, Tensor) or points.is_complex():
         raise ParameterError("points", type(points).__name__, "a real torch tensor")
@@ -108,7 +108,13 @@ def point_columns(robot: Robot, task: TaskSpace, points: Tensor) -> Tensor:
     columns = points.to(device=robot.device, dtype=robot.dtype).reshape(-1, points.shape[-1]).T.contiguous()
     if not bool(columns.isfinite().all()):
         raise ParameterError("points", "NaN or infinite values", "finite values")
-    return columns
+    return task.unit(columns.T).T.contiguous()
+
+
+def tool_points(robot: Robot, task: TaskSpace, q: Tensor) -> Tensor:
+    """The points (N, width) of the task space that the tools of configurations (N, n) are at, or nearest to."""
+    position, rotation = robot.forward_kinematics(q)
+    return task.at(position.T, rotation.permute(1, 2, 0)).T
 
 
 def project_columns(
@@ -207,7 +213,7 @@ class _Projection:
             left = (~done[part]).nonzero()[:, 0]
             if last or len(left) == 0:
                 continue
-            ahead: tuple[Tensor, ...] = (every[part], batch.q[:, part], frames, error, size)
+            ahead: tuple[Tensor, ...] = (every[part], batch.q[:, part], frames, error, size, batch.targets[:, part])
             if len(left) < _LEFT * len(size):
                 few.append(self._equations(*(tensor.index_select(-1, left) for tensor in ahead)))
             else:
@@ -236,10 +242,12 @@ class _Projection:
         torch.minimum(batch.best[part], size, out=batch.best[part])
         return frames, error, size
 
-    def _equations(self, columns: Tensor, q: Tensor, frames: Tensor, error: Tensor, size: Tensor) -> Equations:
+    def _equations(
+        self, columns: Tensor, q: Tensor, frames: Tensor, error: Tensor, size: Tensor, targets: Tensor
+    ) -> Equations:
         """Of a step, a radian counted as `ROTATION_LENGTH` metres."""
         rows = self.task.dimension
-        jacobian = self.task.jacobian(self.robot.tree.jacobian(frames))
+        jacobian = self.task.jacobian(self.robot.tree.jacobian(frames), targets)
         if len(error) > rows:
             error[rows:].mul_(ROTATION_LENGTH)
             jacobian[rows:].mul_(ROTATION_LENGTH)

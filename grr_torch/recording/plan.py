@@ -15,6 +15,7 @@ from grr_torch.recording.curves import curve_views, log_curves
 from grr_torch.recording.robot import RecordedRobot
 from grr_torch.recording.self_motion_view import in_space, line
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.slices import fullest_slice
 
 TIME = "plan"
 _DARK = (18, 20, 26)
@@ -57,10 +58,11 @@ def record_plan(roadmap: Roadmap, path: Path, file: str | os.PathLike[str]) -> N
 
 
 def _log_map(recording: Any, roadmap: Roadmap) -> None:
-    """The roadmap, faint behind the arm."""
+    """The roadmap, faint behind the arm; where rotation varies, in one rotation."""
     import rerun as rr
 
-    points, frame = in_space(roadmap.points.numpy()), rr.CoordinateFrame(roadmap.robot.base)
+    roadmap = fullest_slice(roadmap)
+    points, frame = in_space(roadmap.positions.numpy()), rr.CoordinateFrame(roadmap.robot.base)
     resolved, edges, connected = roadmap.resolved.numpy(), roadmap.edges.numpy(), roadmap.connected.numpy()
     broken = ~connected & resolved[edges].all(1)
     for name, shapes in (
@@ -79,10 +81,10 @@ def _log_way(recording: Any, roadmap: Roadmap, path: Path) -> None:
     tools = roadmap.robot.forward_kinematics(path.configurations)[0].cpu()[:, : roadmap.task.dimension]
     places = in_space(tools.numpy())
     vertices = path.vertices.numpy()
-    used = in_space(roadmap.points.numpy()[vertices])
+    used = in_space(roadmap.positions.numpy()[vertices])
     joined = {frozenset(edge) for edge in roadmap.edges[roadmap.connected].tolist()}
     pairs = [pair for pair in np.stack([vertices[:-1], vertices[1:]], axis=1) if frozenset(pair.tolist()) in joined]
-    edges = in_space(roadmap.points.numpy())[np.array(pairs, dtype=np.int64).reshape(-1, 2)]
+    edges = in_space(roadmap.positions.numpy())[np.array(pairs, dtype=np.int64).reshape(-1, 2)]
     for name, shapes in (
         ("used/vertices", rr.Points3D(used, colors=_USED, radii=line(3.5))),
         ("used/edges", rr.LineStrips3D(edges, colors=_USED, radii=line(1.6))),

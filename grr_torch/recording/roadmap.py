@@ -16,6 +16,7 @@ from grr_torch.recording import colours
 from grr_torch.recording.robot import RecordedRobot
 from grr_torch.recording.tour import tour
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.slices import fullest_slice
 
 WAVE, TOUR = "wave", "tour"
 _TOUR_RATE = 25.0
@@ -31,10 +32,14 @@ def record_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
     because of a winding or a spread above 1 rad, `roadmap/unresolved` are vertices that are reachable but have no
     configuration.
 
+    Where rotation varies, the map is shown in the rotation in which most vertices are resolved.
+
     Raises:
         OutputError: It cannot be written.
     """
     import rerun as rr
+
+    roadmap = fullest_slice(roadmap)
 
     with atomic_write(path) as temporary:
         recording = rr.RecordingStream("grr_torch")
@@ -59,6 +64,7 @@ def show_roadmap(roadmap: Roadmap) -> None:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise GrrError("there is no screen to open the rerun viewer on; write a file with --save F.rrd")
     recording = rr.RecordingStream("grr_torch")
+    roadmap = fullest_slice(roadmap)
     try:
         rr.spawn(executable_path=viewer, recording=recording, default_blueprint=_blueprint(roadmap))
     except RuntimeError as error:
@@ -79,7 +85,7 @@ def _log(recording: Any, roadmap: Roadmap) -> None:
 def _log_map(recording: Any, roadmap: Roadmap) -> None:
     import rerun as rr
 
-    points = _in_space(roadmap.points.numpy())
+    points = _in_space(roadmap.positions.numpy())
     resolved = roadmap.resolved.numpy()
     radius = _radius(roadmap)
     q = roadmap.configurations[roadmap.resolved]
@@ -118,7 +124,7 @@ def _log_waves(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
     """The expansion: what is resolved after each wave, and an arm at its latest vertex."""
     import rerun as rr
 
-    points, wave = _in_space(roadmap.points.numpy()), roadmap.wave.numpy()
+    points, wave = _in_space(roadmap.positions.numpy()), roadmap.wave.numpy()
     edges = roadmap.edges[roadmap.connected].numpy()
     edge_wave = wave[edges].max(1) if len(edges) else np.empty(0, dtype=np.int32)
     frame = rr.CoordinateFrame(roadmap.robot.base)
@@ -153,7 +159,7 @@ def _log_tour(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
         recording.send_columns(
             f"joints/{name}", indexes=[times], columns=rr.Scalars.columns(scalars=q[:, index].numpy())
         )
-    trace = _in_space(points.numpy())
+    trace = _in_space(points[:, : roadmap.task.dimension].numpy())
     recording.log(
         "tour/path",
         rr.CoordinateFrame(roadmap.robot.base),
@@ -207,7 +213,7 @@ def _camera(roadmap: Roadmap) -> Any:
     """From the side and above in space, from above in the plane."""
     import rerun.blueprint as rrb
 
-    shown = roadmap.points[roadmap.resolved] if bool(roadmap.resolved.any()) else roadmap.points
+    shown = roadmap.positions[roadmap.resolved] if bool(roadmap.resolved.any()) else roadmap.positions
     points = _in_space(shown.numpy())
     centre = 0.5 * (points.min(0) + points.max(0))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
@@ -226,7 +232,7 @@ def _in_space(points: np.ndarray) -> np.ndarray:
 
 def _radius(roadmap: Roadmap) -> float:
     """Radius [m] of a vertex as it is drawn: small enough in space that the arm is seen between them."""
-    a, b = roadmap.points[roadmap.edges].unbind(1)
+    a, b = roadmap.positions[roadmap.edges].unbind(1)
     share = 0.125 if roadmap.task.dimension == 2 else 0.05
     return share * float((a - b).norm(dim=1).median()) if len(a) else 0.01
 

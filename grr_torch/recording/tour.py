@@ -49,7 +49,7 @@ def _visited(roadmap: Roadmap) -> list[int]:
     resolved = roadmap.resolved.numpy()
     largest = np.bincount(labels[resolved]).argmax()
     members = np.flatnonzero(resolved & (labels == largest))
-    stops = _spread(roadmap.points.numpy(), members)
+    stops = _spread(roadmap.positions.numpy(), members)
     paths, came_from = dijkstra(graph, directed=False, indices=stops, return_predecessors=True)
     order = [0]
     while len(order) < len(stops):

@@ -16,13 +16,14 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError, SeedError, check_seed
 from grr_torch.progress import Progress, silent
-from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.projection.project import Tolerances, project_columns, tool_points
 from grr_torch.resolution.expand import default_neighbours, grow
 from grr_torch.resolution.reachability import from_random_starts, within_reach
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance, wrap
 from grr_torch.spaces.graph import Copies, TaskGraph, staggered_grid
+from grr_torch.spaces.product import ProductGraph, product_graph
 from grr_torch.spaces.task import TaskSpace
 
 # candidates that are looked for, unless told otherwise
@@ -37,6 +38,8 @@ _TRIED = 3
 _STATIONS = 12
 # vertices of the coarse graph that the arm should reach, in the plane and in space
 _COARSE = {2: 300, 3: 300}
+# so many times as many, and so many rotations at least, where rotation varies
+_TURNED, _FEWEST = 4, 8
 # vertices averaged over on it
 _NEIGHBOURS = 24
 # share of the candidates that are relaxed on it, and of those that are relaxed on the task graph itself
@@ -83,9 +86,10 @@ def find_seeds(
     anchors = -(-candidates // (2 * _MEDOIDS))
     points, medoids, share = _medoids(robot, task, graph, anchors, generator, tolerances)
     paths = _closed_paths(robot, task, points, medoids, tolerances)
-    coarse = _coarse(graph, math.ceil(_COARSE[task.dimension] / share))
+    coarse = _coarse(task, graph, math.ceil(_COARSE[task.dimension] / share))
     progress("choosing seeds", 0, 3)
-    maps = _expansions(robot, task, coarse, paths, _NEIGHBOURS, tolerances)
+    neighbours = _NEIGHBOURS if task.rotations is None else default_neighbours(task)
+    maps = _expansions(robot, task, coarse, paths, neighbours, tolerances)
     progress("choosing seeds", 1, 3)
     best = _costs(robot, task, coarse, maps).argsort(stable=True)[: math.ceil(_RELAXED * len(paths))].tolist()
     relaxed = _relaxed(robot, task, coarse, maps[best], tolerances, _ROUNDS)
@@ -101,8 +105,19 @@ def find_seeds(
     return finalists[int(_costs(robot, task, graph, relaxed).argmin())]
 
 
-def _coarse(graph: TaskGraph, points: int) -> TaskGraph:
-    """A grid over the same box, which is given some thickness where the graph is flat; a small graph itself."""
+def _coarse(task: TaskSpace, graph: TaskGraph, points: int) -> TaskGraph:
+    """A grid over the same box, which is given some thickness where the graph is flat; a small graph itself.
+
+    Where rotation varies, one of several times as many points, of which fewer rotations take a share.
+    """
+    if isinstance(graph, ProductGraph):
+        points *= _TURNED
+        if len(graph.points) <= points:
+            return graph
+        # as fine in each of the dimensions of rotation as in those of position
+        share = (task.constraints - task.dimension) / task.constraints
+        rotations = min(len(graph.rotations.values), max(_FEWEST, round(points**share)))
+        return product_graph(task, _coarse(task, graph.positions, max(1, points // rotations)), rotations)
     if len(graph.points) <= points:
         return graph
     low, high = graph.points.amin(0), graph.points.amax(0)
@@ -122,7 +137,7 @@ def _expansions(
     size = len(graph.points)
     seeds = torch.cat(candidates)
     owner = torch.arange(len(candidates)).repeat_interleave(torch.tensor([len(path) for path in candidates]))
-    nearest = graph.nearest(robot.forward_kinematics(seeds)[0][:, : task.dimension])[:, 0]
+    nearest = graph.nearest(tool_points(robot, task, seeds))[:, 0]
     targets = graph.points[nearest].to(seeds)
     solved, valid = project_columns(robot, task, targets.T.contiguous(), seeds.T.contiguous(), tolerances)
     valid = valid.cpu()
@@ -188,7 +203,7 @@ def _closed_paths(
     axis, origin = mount[2, :3], mount[3, :3]
     paths: list[Tensor] = []
     angles = [2.0 * math.pi * k / _STATIONS for k in range(_STATIONS)]
-    stations = torch.stack([_turned(points, axis, origin, angle) for angle in angles])
+    stations = torch.stack([_turned(task, points, axis, origin, angle) for angle in angles])
     for rigid in (1.0, 0.0):
         q = configurations
         found: list[Tensor] = []
@@ -207,15 +222,18 @@ def _closed_paths(
     return paths or [q[None] for q in configurations]
 
 
-def _turned(points: Tensor, axis: Tensor, origin: Tensor, angle: float) -> Tensor:
-    """Points (K, d) turned about an axis in space; in the plane, about where it crosses."""
-    d = points.shape[1]
+def _turned(task: TaskSpace, points: Tensor, axis: Tensor, origin: Tensor, angle: float) -> Tensor:
+    """Points (K, width) turned about an axis in space; in the plane, about where it crosses."""
+    d = task.dimension
     arms = torch.zeros(len(points), 3, dtype=points.dtype, device=points.device)
-    arms[:, :d] = points - origin[:d]
+    arms[:, :d] = points[:, :d] - origin[:d]
     along = (arms @ axis)[:, None] * axis
     across = arms - along
     turned = along + math.cos(angle) * across + math.sin(angle) * torch.linalg.cross(axis.expand_as(across), across)
-    return origin[:d] + turned[:, :d]
+    moved = origin[:d] + turned[:, :d]
+    if task.rotations is None:
+        return moved
+    return torch.cat([moved, task.rotations.turned(points[:, d:], axis, angle)], dim=1)
 
 
 def _costs(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Tensor:

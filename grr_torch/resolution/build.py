@@ -37,6 +37,7 @@ def build(
     points: int | TaskGraph | None = None,
     bounds: Bounds | None = None,
     seeds: SeedsLike | str | None = None,
+    rotations: int | None = None,
     method: str = "expansion",
     candidates: int = CANDIDATES,
     neighbours: int | None = None,
@@ -58,10 +59,13 @@ def build(
         task: The task space, or the kind of one that the preset has.
         points: How many vertices a staggered grid over `bounds` is asked for, or a task graph.
         bounds: (low, high) of each axis of the grid [m].
+        rotations: How many rotations the grid has beside its positions, where rotation varies: yaws on a ring,
+            directions on the sphere, or orientations.
         seeds: (S, n) configurations that the expansion starts from, or "auto": they are found.
         candidates: How many sets of seeds are compared, where they are found; more take longer and may do better.
         method: "expansion", or "random": random configurations at every vertex and a constraint solver.
         neighbours: How many of the nearest vertices are averaged over; 24 in the plane and 64 in space by default.
+            Where rotation varies, the vertices up to so many edges away, 2 by default.
         samples: Random configurations of a vertex, for the method "random".
         refine: Whether the roadmap is repaired, relaxed and certified after the expansion.
         objectives: Weights of "clearance", "manipulability" and "limits", which refinement serves besides smoothness;
@@ -78,7 +82,7 @@ def build(
         ParameterError: Something is missing or out of its range, or no point lies within the arm's reach.
         SeedError: No seed can be used.
     """
-    problem = pose_problem(robot, task, points, bounds, seeds)
+    problem = pose_problem(robot, task, points, bounds, seeds, rotations)
     check_seed(seed)
     check_objectives(robot, objectives)
     if objectives and not refine:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.spaces.cliques import draw
 from grr_torch.spaces.configuration import difference, distance
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ LARGEST_SPREAD = 1.0
 # projections on the way from a corner to the centre
 _STEPS = 8
 _CELLS_AT_ONCE = 8192
+# cells of a space in which rotation varies that are measured: those of a product are too many
+_MOST_MEASURED = 20_000
 
 
 @dataclass(frozen=True)
@@ -66,48 +69,14 @@ class Cells:
 
 
 def measure_cells(roadmap: Roadmap, corners: Tensor, progress: Progress = silent) -> Cells:
-    """Winding and spread of cells given by their corners (C, k)."""
+    """Winding and spread of cells given by their corners (C, k); where rotation varies, of at most 20,000 of them."""
     robot = roadmap.robot
+    if roadmap.task.rotations is not None:
+        corners = corners[draw(len(corners), _MOST_MEASURED)]
     wraps = robot.continuous.cpu()
     q = roadmap.configurations[corners]
     turns = difference(q, q.roll(-1, dims=1), wraps).sum(1) / (2.0 * math.pi)
     return Cells(corners, torch.where(wraps, turns.round(), 0.0).to(torch.int64), _spread(roadmap, corners, progress))
-
-
-def triangles(edges: Tensor, vertices: int) -> Tensor:
-    """(C, 3) all triangles of a graph, smallest vertex first.
-
-    Args:
-        edges: (E, 2) edges.
-        vertices: How many vertices there are.
-    """
-    edges = edges.sort(dim=1).values
-    keys, order = (edges[:, 0] * vertices + edges[:, 1]).sort()
-    first, second = edges[order].unbind(1)
-    starts = torch.searchsorted(first.contiguous(), torch.arange(vertices + 1))
-    # of every edge (a, b), the edges (a, c) with c > b: is (b, c) one too?
-    counts = starts[first + 1] - torch.arange(len(first)) - 1
-    edge = torch.repeat_interleave(torch.arange(len(first)), counts)
-    beyond = edge + 1 + torch.arange(len(edge)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
-    closed = _are_edges(keys, second[edge] * vertices + second[beyond])
-    edge, beyond = edge[closed], beyond[closed]
-    return torch.stack([first[edge], second[edge], second[beyond]], dim=1)
-
-
-def squares(roadmap: Roadmap) -> Tensor:
-    """(C, 4) faces of a staggered grid in space all of whose edges are connected; none for other graphs."""
-    lattice, vertices = roadmap.graph.lattice, len(roadmap.points)
-    faces = torch.empty(0, 4, dtype=torch.long) if lattice is None else lattice.faces()
-    keys = (roadmap.edges[roadmap.connected] @ torch.tensor([vertices, 1])).sort().values
-    ends = torch.stack([faces, faces.roll(-1, dims=1)], dim=-1).sort(dim=-1).values
-    return faces[_are_edges(keys, ends @ torch.tensor([vertices, 1])).all(1)]
-
-
-def _are_edges(keys: Tensor, wanted: Tensor) -> Tensor:
-    """Which of the wanted keys are among the sorted ones."""
-    if len(keys) == 0:
-        return torch.zeros_like(wanted, dtype=torch.bool)
-    return keys[torch.searchsorted(keys, wanted).clamp(max=len(keys) - 1)] == wanted
 
 
 def lead_to_centres(
@@ -138,7 +107,7 @@ def lead_to_centres(
 
 def _lead(robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances) -> tuple[Tensor, Tensor]:
     count, sides, _ = points.shape
-    centre = points.mean(1, keepdim=True).expand_as(points)
+    centre = task.centre(points)[:, None].expand_as(points)
     columns = q.reshape(-1, robot.n).T.contiguous()
     followed = torch.ones(columns.shape[1], dtype=torch.bool, device=columns.device)
     for step in range(1, _STEPS + 1):

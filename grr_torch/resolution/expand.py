@@ -17,6 +17,7 @@ from grr_torch.resolution.seeds import SeedsLike, check_seeds, place_seeds
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import average, embed
 from grr_torch.spaces.graph import TaskGraph
+from grr_torch.spaces.product import MOST_HOPS, ProductGraph
 from grr_torch.spaces.task import TaskSpace
 
 # vertices whose neighbours are listed at once
@@ -64,18 +65,21 @@ def expand(
         graph: The task graph G_p.
         seeds: (S, n) configurations; each goes to the vertex nearest to its tool.
         neighbours: How many of the nearest vertices are averaged over, as far as they are resolved; by default 24
-            in the plane and 64 in space.
+            in the plane and 64 in space. Where rotation varies, how many edges away they are at most instead, by
+            default 2.
         tolerances: Of the projections.
         progress: Told how many vertices are resolved.
 
     Raises:
         SeedError: No seed can be used.
-        ParameterError: `neighbours` is below 1.
+        ParameterError: `neighbours` is below 1, or above 3 where rotation varies.
     """
     if neighbours is None:
         neighbours = default_neighbours(task)
     if neighbours < 1:
         raise ParameterError("neighbours", neighbours, "1 or more")
+    if task.rotations is not None and neighbours > MOST_HOPS:
+        raise ParameterError("neighbours", neighbours, f"1 to {MOST_HOPS} edges, as rotation varies")
     vertices, placed = place_seeds(robot, task, graph, check_seeds(robot, seeds), tolerances)
     return grow(robot, task, graph, vertices, placed, neighbours=neighbours, tolerances=tolerances, progress=progress)
 
@@ -125,7 +129,8 @@ def _average(
     2n multiply-adds a neighbour. Weights are 1 / d²: what (max d / d)² is, but for a factor.
     """
     sums: list[Tensor] = []
-    for part in vertices.split(_VERTICES_AT_ONCE):
+    # a product has some hundreds of neighbours, not some tens
+    for part in vertices.split(_VERTICES_AT_ONCE >> (3 if isinstance(graph, ProductGraph) else 0)):
         nearest, distances = graph.neighbours(part, neighbours)
         if nearest.numel() == 0:
             sums.append(embedded.new_zeros(len(part), embedded.shape[1]))
@@ -137,5 +142,7 @@ def _average(
 
 
 def default_neighbours(task: TaskSpace) -> int:
-    """How many nearest vertices are averaged over: 24 in the plane, 64 in space."""
+    """How many nearest vertices are averaged over: 24 in the plane, 64 in space; 2 edges away where rotation varies."""
+    if task.rotations is not None:
+        return 2
     return 24 if task.dimension == 2 else 64

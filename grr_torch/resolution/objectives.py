@@ -116,7 +116,10 @@ def _values(robot: Robot, task: TaskSpace, name: str, q: Tensor) -> Tensor:
     if name == "clearance":
         return robot.self_collision_distance(q.T)[None]
     if name == "manipulability":
-        jacobian = task.jacobian(robot.tree.jacobian(robot.tree.frames(q)))
+        frames = robot.tree.frames(q)
+        # √det(J Jᵀ) does not depend on the basis that the points give
+        points = task.at(*robot.tree.tool_pose(frames)).detach()
+        jacobian = task.jacobian(robot.tree.jacobian(frames), points)
         normal = torch.einsum("anN,bnN->Nab", jacobian, jacobian)
         normal = normal + _LEAST_PIVOT * torch.eye(len(jacobian), dtype=q.dtype, device=q.device)
         return (0.5 * torch.logdet(normal)).exp()[None]

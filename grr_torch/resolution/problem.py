@@ -10,9 +10,11 @@ import torch
 from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError
 from grr_torch.resolution.reachability import reach, within_reach
 from grr_torch.resolution.seeds import SeedsLike
+from grr_torch.robots.presets import Problem as Preset
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph, staggered_grid
-from grr_torch.spaces.task import TaskSpace, make_task
+from grr_torch.spaces.product import ProductGraph, product_graph
+from grr_torch.spaces.task import KINDS, TaskSpace, make_task
 
 
 class Problem(NamedTuple):
@@ -35,6 +37,7 @@ def pose_problem(
     points: int | TaskGraph | None = None,
     bounds: Bounds | None = None,
     seeds: SeedsLike | str | None = None,
+    rotations: int | None = None,
 ) -> Problem:
     """Task, graph and seeds, with what was not given taken from the robot's preset; as `build` takes them.
 
@@ -42,10 +45,22 @@ def pose_problem(
         UnknownNameError: No such task or seeds.
         ParameterError: Something is missing, does not fit the robot, or lies beyond its reach.
     """
-    problem = _complete(robot, task, points, bounds, seeds)
+    problem = _complete(robot, task, points, bounds, seeds, rotations)
     check_task(robot, problem.task)
     _check_reach(robot, problem.task, problem.graph)
     return problem
+
+
+def _turned(task: TaskSpace, positions: TaskGraph, rotations: int | None, problem: Preset | None) -> TaskGraph:
+    """The product of positions and rotations."""
+    if rotations is None and problem is not None:
+        rotations = problem.rotations
+    if rotations is None:
+        raise ParameterError("rotations", "nothing", f"how many rotations the grid of the task '{task.kind}' has")
+    if positions.points.shape[1] != task.dimension:
+        given = f"{positions.points.shape[1]} coordinates"
+        raise ParameterError("points", given, f"{task.dimension}: positions, or a product_graph")
+    return product_graph(task, positions, rotations)
 
 
 def check_task(robot: Robot, task: TaskSpace) -> None:
@@ -86,6 +101,7 @@ def _complete(
     points: int | TaskGraph | None,
     bounds: Bounds | None,
     seeds: SeedsLike | str | None,
+    rotations: int | None,
 ) -> Problem:
     """Task, graph and seeds, with what was not given taken from the robot's preset."""
     preset = robot.preset
@@ -107,8 +123,11 @@ def _complete(
         raise UnknownNameError("seeds", seeds, ("auto",), " Or a table of configurations.")
     if not isinstance(task, TaskSpace):
         if kind is None:
-            raise ParameterError("task", "not given", "'position' or 'fixed-rotation'")
-        task = make_task(kind, graph.points.shape[1], problem.rotation if problem else None)
+            raise ParameterError("task", "not given", ", ".join(KINDS))
+        d = graph.positions.points.shape[1] if isinstance(graph, ProductGraph) else graph.points.shape[1]
+        task = make_task(kind, d, problem.rotation if problem else None)
+    if not isinstance(graph, ProductGraph) and (rotations is not None or task.rotations is not None):
+        graph = _turned(task, graph, rotations, problem)
     if graph.points.shape[1] != task.width:
         raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.width} for {task.name}")
     return Problem(task, graph, seeds)

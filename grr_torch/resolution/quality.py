@@ -40,11 +40,13 @@ class Quality:
         smoothness_p99: Their 99th percentile [rad/m].
         smoothness_max: The largest of them [rad/m].
         steep_edges: Connected edges whose ratio is more than ten times the median: suspect.
-        triangles: Triangles of the graph with three connected edges.
+        triangles: Triangles of the graph with three connected edges; where rotation varies, of these and of squares, at
+            most 20,000 that were drawn and measured.
         triangles_wound: Those round which some joint makes a full turn.
         triangles_spread: Others whose corners lead to configurations more than 1 rad apart at the centre.
         triangles_certified: The rest, as a share.
-        squares: Faces of a spatial grid's cells with four connected edges.
+        squares: Faces of a spatial grid's cells with four connected edges; where rotation varies, also those between
+            two neighbouring positions in two neighbouring rotations.
         squares_wound: As of triangles.
         squares_spread: As of triangles.
         squares_certified: As of triangles.

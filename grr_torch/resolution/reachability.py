@@ -64,10 +64,23 @@ def from_random_starts(
 
 
 def within_reach(robot: Robot, task: TaskSpace, points: Tensor) -> Tensor:
-    """Points (V,) no farther from the first joint than the arm is long: what lies beyond cannot be reached."""
+    """Points (V,) no farther from the first joint than the arm is long: what lies beyond cannot be reached.
+
+    Where rotation varies but is given, the last joint has to be within the reach of what comes before it as well.
+    """
     centre, radius = reach(robot)
     d = task.dimension
-    return (points[:, :d].cpu() - centre[:d]).norm(dim=1) <= radius + 1e-6
+    points = points.cpu()
+    inside = (points[:, :d] - centre[:d]).norm(dim=1) <= radius + 1e-6
+    tree = robot.tree
+    turned = task.matrices(points.T) if task.rotations is not None else None
+    if turned is None or tree.links[tree.tool][0] != tree.path[-1] or not tree.joints[tree.path[-1]].revolute:
+        return inside
+    # frames are stored with their axes as rows
+    mount = tree.links[tree.tool][1].cpu().to(points)
+    hand = mount[:3, :3] @ mount[3, :3]
+    wrist = points[:, :d] - torch.einsum("ijN,j->Ni", turned, hand)[:, :d]
+    return inside & ((wrist - centre[:d]).norm(dim=1) <= radius - float(hand.norm()) + 1e-6)
 
 
 def reach(robot: Robot) -> tuple[Tensor, float]:

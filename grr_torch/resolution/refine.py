@@ -12,7 +12,6 @@ from torch import Tensor
 
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
-from grr_torch.resolution.cells import triangles
 from grr_torch.resolution.certify import certify
 from grr_torch.resolution.edges import continuous_edges
 from grr_torch.resolution.objectives import Objective, check_objectives, measure_objective
@@ -92,7 +91,7 @@ def _relaxed(roadmap: Roadmap, weights: Mapping[str, float], tolerances: Toleran
     network = _network(roadmap, vertices, rank[edges], weights)
     old = roadmap.configurations[vertices].to(roadmap.robot.lower)
     new = relax(network, old.T.contiguous(), tolerances, progress)
-    cells = rank[triangles(edges, len(roadmap.points))].to(roadmap.robot.device)
+    cells = rank[roadmap.graph.triangles(roadmap.connected)].to(roadmap.robot.device)
     new = certify(network, cells, new, tolerances, progress).T
     configurations = roadmap.configurations.clone()
     configurations[vertices] = new.cpu()

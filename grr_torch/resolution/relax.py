@@ -157,7 +157,7 @@ def gauss_newton_step(network: Network, q: Tensor, damping: float | Tensor, pull
     robot = network.robot
     motions = network.motions(q)
     weights = 1.0 / ((motions.square().sum(0) + _SHORTEST**2).sqrt() * network.lengths)
-    jacobian = network.task.jacobian(robot.tree.jacobian(robot.tree.frames(q)))
+    jacobian = network.task.jacobian(robot.tree.jacobian(robot.tree.frames(q)), network.targets)
     # small, but large enough for the pivots of a straight arm
     projector = null_space_projector(jacobian, torch.finfo(q.dtype).eps ** 0.6)
     incidence = network.incidence

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from grr_torch.progress import Progress, silent
-from grr_torch.resolution.cells import Cells, measure_cells, squares, triangles
+from grr_torch.resolution.cells import Cells, measure_cells
 from grr_torch.resolution.quality import Quality, measure_quality
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import TaskGraph, find_lattice
+from grr_torch.spaces.product import find_product
 from grr_torch.spaces.task import TaskSpace
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class Roadmap:
     Attributes:
         robot: The robot.
         task: The task space.
-        points: (V, width) points of the task space [m].
+        points: (V, width) points of the task space [m, rad, or parts of unit vectors].
         configurations: (V, n) configurations [rad or m], NaN where unresolved; continuous joints in [−π, π].
         resolved: (V,) bool, vertices that have a configuration.
         edges: (E, 2) vertex indices of the task graph's edges.
@@ -63,9 +64,16 @@ class Roadmap:
             f"{int(self.connected.sum())} edges connected)"
         )
 
+    @property
+    def positions(self) -> Tensor:
+        """(V, d) where the tool is at the vertices [m]."""
+        return self.points[:, : self.task.dimension]
+
     @cached_property
     def graph(self) -> TaskGraph:
         """The task graph G_p."""
+        if self.task.rotations is not None:
+            return find_product(self.task, self.points, self.edges)
         return TaskGraph(self.points, self.edges, find_lattice(self.points))
 
     def quality(self, progress: Progress = silent) -> Quality:
@@ -81,11 +89,14 @@ class Roadmap:
     def cells(self, progress: Progress = silent) -> tuple[Cells, Cells]:
         """The triangles of the roadmap, and in R³ the faces of its grid's cells, with their winding and spread.
 
+        Where rotation varies, the faces are also those of an edge between positions and one between rotations; and of
+        triangles and faces, a random 20,000 each stand for all.
+
         Args:
             progress: Told how many cells are measured.
         """
         if "cells" not in self._measured:
-            corners = triangles(self.edges[self.connected], len(self.points)), squares(self)
+            corners = self.graph.triangles(self.connected), self.graph.faces(self.connected)
             self._measured["cells"] = tuple(measure_cells(self, part, progress) for part in corners)
         return self._measured["cells"]
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import FileFormatError, GrrWarning, SeedError
-from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.projection.project import Tolerances, project_columns, tool_points
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import TaskGraph
@@ -77,7 +77,7 @@ def check_seeds(robot: Robot, seeds: SeedsLike) -> Tensor:
 def place_seeds(
     robot: Robot, task: TaskSpace, graph: TaskGraph, seeds: Tensor, tolerances: Tolerances
 ) -> tuple[Tensor, Tensor]:
-    """Projects each seed to the vertex nearest to its tool position, or the next nearest of eight that it reaches.
+    """Projects each seed to the vertex nearest to its tool, or the next nearest of eight that it reaches.
 
     Of seeds that share a vertex, the one that had to move least is kept. Seeds that cannot be used are named in a
     GrrWarning.
@@ -88,8 +88,7 @@ def place_seeds(
     Raises:
         SeedError: No seed can be used.
     """
-    position, _ = robot.forward_kinematics(seeds)
-    nearest = graph.nearest(position[:, : task.dimension], _TRIED)
+    nearest = graph.nearest(tool_points(robot, task, seeds), _TRIED)
     tried = nearest.shape[1]
     targets = graph.points[nearest].to(seeds).reshape(-1, task.width)
     guesses = seeds.repeat_interleave(tried, dim=0)

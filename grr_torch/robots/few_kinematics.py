@@ -9,12 +9,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from grr_torch.pieces import Array
 
 if TYPE_CHECKING:
     from grr_torch.robots.kinematics import KinematicTree
-
-Array = NDArray[Any]
 
 
 class FewKinematics:

@@ -19,13 +19,15 @@ class Problem:
         points: How many vertices the staggered grid is asked for.
         bounds: (low, high) of each axis [m].
         seeds: Configurations the expansion starts from.
-        rotation: Fixed-axis roll, pitch, yaw of the tool [rad], for `fixed-rotation`.
+        rotation: Fixed-axis roll, pitch, yaw of the tool [rad], for `fixed-rotation`, and for `yaw` at yaw 0.
+        rotations: How many rotations the grid has, where rotation varies.
     """
 
     points: int
     bounds: tuple[tuple[float, float], ...]
     seeds: tuple[tuple[float, ...], ...]
     rotation: tuple[float, float, float] | None
+    rotations: int | None = None
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,7 @@ def _problem(entry: Mapping[str, Any]) -> Problem:
         bounds=tuple((float(low), float(high)) for low, high in entry["bounds"]),
         seeds=tuple(tuple(map(float, seed)) for seed in entry["seeds"]),
         rotation=None if rotation is None else (float(rotation[0]), float(rotation[1]), float(rotation[2])),
+        rotations=entry.get("rotations"),
     )
 
 

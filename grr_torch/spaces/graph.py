@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
+from grr_torch.spaces.cliques import closed, triangles
 from grr_torch.spaces.lattice import Lattice
 
 Bounds = Sequence[tuple[float, float]]
@@ -22,7 +23,7 @@ Bounds = Sequence[tuple[float, float]]
 # metres beyond which a bound is a mistake
 _FARTHEST = 1e6
 # neighbour tables of a larger graph would not fit a laptop
-_MOST_POINTS = 2_000_000
+MOST_POINTS = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class TaskGraph:
     """Points and edges; immutable.
 
     Attributes:
-        points: (V, d) positions [m], float64, on the CPU.
+        points: (V, width) points of the task space [m], float64, on the CPU.
         edges: (E, 2) vertex indices, smaller one first.
         lattice: Where the points are a staggered grid's: its arithmetic, which finds neighbours without a search.
     """
@@ -61,6 +62,7 @@ class TaskGraph:
         """The k nearest other vertices of some vertices.
 
         In a staggered grid, those as near as the k-th are among them, and what would lie beyond its border is not.
+        Where rotation varies, k counts edges: by D_p alone, many rotations at one place are nearer than any other.
 
         Args:
             vertices: (F,) vertices.
@@ -103,6 +105,15 @@ class TaskGraph:
         rank = torch.repeat_interleave(torch.arange(len(chosen)), counts)
         places = torch.arange(len(rank)) + (starts[chosen] - counts.cumsum(0) + counts)[rank]
         return rank.to(vertices.device), ends[places].to(vertices.device)
+
+    def triangles(self, kept: Tensor) -> Tensor:
+        """(C, 3) triangles of those edges that are kept (E,), smallest vertex first."""
+        return triangles(self.edges[kept], len(self.points))
+
+    def faces(self, kept: Tensor) -> Tensor:
+        """(C, 4) faces of a spatial grid's cells all of whose edges are kept (E,); none in other graphs."""
+        corners = torch.empty(0, 4, dtype=torch.long) if self.lattice is None else self.lattice.faces()
+        return closed(corners, self.edges[kept], len(self.points))
 
     def edge_between(self, first: Tensor, second: Tensor) -> Tensor:
         """Indices (K,) of the edges that join vertices (K,) to others (K,)."""
@@ -170,8 +181,8 @@ def check_count(points: int) -> int:
     Raises:
         ParameterError: It is below 1 or beyond what could be held.
     """
-    if isinstance(points, bool) or not hasattr(points, "__index__") or not 1 <= points <= _MOST_POINTS:
-        raise ParameterError("points", points, f"a whole number from 1 to {_MOST_POINTS:,}")
+    if isinstance(points, bool) or not hasattr(points, "__index__") or not 1 <= points <= MOST_POINTS:
+        raise ParameterError("points", points, f"a whole number from 1 to {MOST_POINTS:,}")
     return int(points)
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from grr_torch.pieces import Array
 
 # below any sine of an angle that is not 0, and above what a division makes infinite
 _TINY = 1e-30
@@ -28,6 +28,17 @@ def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Tensor:
         ],
         dtype=torch.float64,
     )
+
+
+def matrix_from_quaternion(quaternions: Tensor) -> Tensor:
+    """Rotation matrices (3, 3, N) of unit quaternions (4, N)."""
+    w, x, y, z = quaternions
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row) for row in rows])
 
 
 def quaternion_from_matrix(rotation: Tensor) -> Tensor:
@@ -52,8 +63,8 @@ def quaternion_from_matrix(rotation: Tensor) -> Tensor:
 
 
 def quaternion_distance(first: Tensor, second: Tensor) -> Tensor:
-    """D_SO(3) = 1 − |o_i · o_j| (*batch,) of unit quaternions (*batch, 4)."""
-    return 1.0 - (first * second).sum(-1).abs()
+    """D_SO(3) = 1 − |o_i · o_j| (*batch,) of unit quaternions (*batch, 4), as ½ ‖o_i ∓ o_j‖²: exact for near ones."""
+    return 0.5 * torch.minimum((first - second).square().sum(-1), (first + second).square().sum(-1))
 
 
 def slerp(start: Tensor, end: Tensor, fraction: float | Tensor) -> Tensor:
@@ -94,7 +105,7 @@ def rotation_error(target: Tensor, rotation: Tensor) -> Tensor:
     return error
 
 
-def rotation_error_of_few(target: NDArray[Any], rotation: NDArray[Any]) -> NDArray[Any]:
+def rotation_error_of_few(target: Array, rotation: Array) -> Array:
     """`rotation_error` for arrays, of one target (3, 3): a third of its time for a few columns."""
     turn = (target.astype(rotation.dtype) @ rotation.transpose(1, 0, 2).reshape(3, -1)).reshape(9, -1)
     twisted = 0.5 * (turn[[7, 2, 3]] - turn[[5, 6, 1]])

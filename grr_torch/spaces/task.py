@@ -1,13 +1,8 @@
-"""Task spaces: their metric, their interpolation, and the error of a configuration against a point.
-
-A point of a task space is a row of a (*batch, width) tensor. What it leaves open, or what stands fixed in the task,
-is not in the row: for `position` and `fixed-rotation` a row is the position alone.
-"""
+"""Task spaces by name, and those in which rotation does not vary."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,128 +10,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from grr_torch.errors import ParameterError, UnknownNameError
+from grr_torch.pieces import Array
+from grr_torch.spaces.base import ROTATION_WEIGHT, TRANSLATION_WEIGHT, TaskSpace
 from grr_torch.spaces.configuration import wrap
-from grr_torch.spaces.rotation import (
-    matrix_from_rpy,
-    quaternion_distance,
-    quaternion_from_matrix,
-    rotation_error,
-    rotation_error_of_few,
-    slerp,
-)
+from grr_torch.spaces.rotation import matrix_from_rpy, rotation_error, rotation_error_of_few
+from grr_torch.spaces.turning import Axis, Pose, Yaw
 
-Array = NDArray[Any]
-
-# weights of translation and rotation in D_p (Section IV-B of the paper)
-TRANSLATION_WEIGHT = 1.0
-ROTATION_WEIGHT = 0.3
-
-
-@dataclass(frozen=True)
-class TaskSpace(ABC):
-    """A task space over positions in R² or R³.
-
-    Attributes:
-        dimension: 2 or 3: how many coordinates of the tool's position count.
-    """
-
-    dimension: int
-    kind: ClassVar[str]
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.dimension, int) or self.dimension not in (2, 3):
-            raise ParameterError("task dimension", self.dimension, "2 or 3")
-
-    @property
-    def width(self) -> int:
-        """Entries of a point: its position, as long as rotation does not vary."""
-        return self.dimension
-
-    @property
-    @abstractmethod
-    def constraints(self) -> int:
-        """How many equations a point imposes on a configuration."""
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """The space in the paper's notation."""
-
-    @abstractmethod
-    def quaternions(self, points: Tensor) -> Tensor | None:
-        """Orientations (*batch, 4) that points (*batch, width) demand; None where rotation is free."""
-
-    @abstractmethod
-    def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
-        """Rotation part (r, N) [rad] of `error`; r rows, none where rotation is free."""
-
-    @abstractmethod
-    def to_json(self) -> dict[str, Any]:
-        """The task as `task_from_json` reads it."""
-
-    def distance(self, first: Tensor, second: Tensor) -> Tensor:
-        """D_p (*batch,) = w_t ‖t_i − t_j‖ + w_o (1 − |o_i · o_j|), with w_t = 1 and w_o = 0.3 (Section IV-B).
-
-        Args:
-            first: (*batch, width) points.
-            second: (*batch, width) points.
-        """
-        d = self.dimension
-        result = TRANSLATION_WEIGHT * (first[..., :d] - second[..., :d]).norm(dim=-1)
-        orientations = self.quaternions(first), self.quaternions(second)
-        if orientations[0] is not None and orientations[1] is not None:
-            result = result + ROTATION_WEIGHT * quaternion_distance(orientations[0], orientations[1])
-        return result
-
-    def interpolate(self, start: Tensor, end: Tensor, fraction: float | Tensor) -> Tensor:
-        """Points `fraction` of the way from start to end (BisectP at 0.5): straight in translation, slerp in rotation.
-
-        Args:
-            start: (*batch, width) points.
-            end: (*batch, width) points.
-            fraction: 0 at `start`, 1 at `end`; a number or a tensor that broadcasts.
-        """
-        d = self.dimension
-        translation = start[..., :d] + fraction * (end[..., :d] - start[..., :d])
-        if start.shape[-1] == d:
-            return translation
-        orientations = self.quaternions(start), self.quaternions(end)
-        if orientations[0] is None or orientations[1] is None:
-            return translation
-        return torch.cat([translation, slerp(orientations[0], orientations[1], fraction)], dim=-1)
-
-    def error(self, targets: Tensor, position: Tensor, rotation: Tensor) -> Tensor:
-        """What is left to the target: (constraints, N), translation rows [m] above rotation rows [rad].
-
-        Args:
-            targets: (width, N) points as columns.
-            position: (3, N) tool positions [m].
-            rotation: (3, 3, N) tool rotations.
-        """
-        translation = targets[: self.dimension] - position[: self.dimension]
-        if self.constraints == self.dimension:
-            return translation
-        return torch.cat([translation, self.rotation_error(targets, rotation)])
-
-    def error_of_few(self, targets: Array, position: Array, rotation: Array) -> Array:
-        """`error` for arrays: what a space has no faster way for is left to torch."""
-        tensors = (torch.from_numpy(np.ascontiguousarray(array)) for array in (targets, position, rotation))
-        return self.error(*tensors).numpy()
-
-    def jacobian(self, jacobian: Tensor) -> Tensor:
-        """Rows (constraints, n, N) of a geometric Jacobian (6, n, N) that answer to `error`."""
-        rotation_rows = self.constraints - self.dimension
-        if self.dimension == 3 and rotation_rows in (0, 3):
-            return jacobian[: 3 + rotation_rows]
-        return torch.cat([jacobian[: self.dimension], jacobian[6 - rotation_rows :]])
-
-    def residuals(self, error: Tensor) -> tuple[Tensor, Tensor]:
-        """Norms (N,) of an error's translation [m] and rotation [rad] parts."""
-        return error[: self.dimension].norm(dim=0), error[self.dimension :].norm(dim=0)
+__all__ = [
+    "KINDS", "ROTATION_WEIGHT", "TRANSLATION_WEIGHT", "Axis", "FixedRotation", "Pose", "Position", "TaskSpace", "Yaw",
+    "make_task", "task_from_json",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -154,10 +40,6 @@ class Position(TaskSpace):
     def name(self) -> str:
         """R2 or R3."""
         return f"R{self.dimension}"
-
-    def quaternions(self, points: Tensor) -> Tensor | None:
-        """None: rotation is free."""
-        return None
 
     def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
         """No rows."""
@@ -205,9 +87,9 @@ class FixedRotation(TaskSpace):
         """The tool's rotation matrix (3, 3)."""
         return matrix_from_rpy(*self.rpy)
 
-    def quaternions(self, points: Tensor) -> Tensor | None:
-        """The one orientation, for every point."""
-        return quaternion_from_matrix(self.rotation).to(points).expand(*points.shape[:-1], 4)
+    def matrices(self, targets: Tensor) -> Tensor:
+        """The one rotation, for every point."""
+        return self.rotation.to(targets)[..., None]
 
     def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
         """Rotation vectors (3, N) in space, wrapped yaw differences (1, N) in the plane [rad]."""
@@ -227,30 +109,48 @@ class FixedRotation(TaskSpace):
         return {"kind": self.kind, "dimension": self.dimension, "rotation": list(self.rpy)}
 
 
-def make_task(kind: str, dimension: int, rpy: Sequence[float] | None = None) -> TaskSpace:
+KINDS = (Position.kind, FixedRotation.kind, Yaw.kind, Axis.kind, Pose.kind)
+
+
+def make_task(
+    kind: str, dimension: int, rpy: Sequence[float] | None = None, axis: Sequence[float] | None = None
+) -> TaskSpace:
     """The task space of a kind by its name.
 
     Args:
-        kind: "position" or "fixed-rotation".
+        kind: "position", "fixed-rotation", "yaw", "axis" or "pose".
         dimension: 2 or 3.
-        rpy: Fixed-axis roll, pitch, yaw [rad] for "fixed-rotation"; zero by default.
+        rpy: Fixed-axis roll, pitch, yaw [rad] for "fixed-rotation", and for "yaw" at yaw 0; zero by default.
+        axis: For "yaw", what the tool turns about, in the base frame; for "axis", the tool's axis, in its own frame;
+            z by default.
 
     Raises:
         UnknownNameError: No such kind.
-        ParameterError: The dimension or the angles are not valid.
+        ParameterError: The dimension, the angles or the axis are not valid, or the kind has none.
     """
+    if kind not in KINDS:
+        raise UnknownNameError("task", kind, KINDS)
+    if rpy is not None and kind not in (FixedRotation.kind, Yaw.kind):
+        raise ParameterError("rotation", tuple(rpy), f"none for the task '{kind}', which leaves it free")
+    if axis is not None and kind not in (Axis.kind, Yaw.kind):
+        raise ParameterError("axis", tuple(axis), f"none for the task '{kind}', which has none")
+    angles = _three("rotation", rpy or (0.0, 0.0, 0.0), "three finite angles: roll, pitch, yaw [rad]")
+    vector = _three("axis", axis or (0.0, 0.0, 1.0), "three finite numbers that are not all zero")
     if kind == Position.kind:
-        if rpy is not None:
-            raise ParameterError("rotation", tuple(rpy), "none for the task 'position', which leaves it free")
         return Position(dimension)
     if kind == FixedRotation.kind:
-        angles = tuple(rpy or (0.0, 0.0, 0.0))
-        if len(angles) != 3:
-            raise ParameterError("rotation", angles, "three finite angles: roll, pitch, yaw [rad]")
-        return FixedRotation(dimension, (angles[0], angles[1], angles[2]))
-    raise UnknownNameError("task", kind, (Position.kind, FixedRotation.kind))
+        return FixedRotation(dimension, angles)
+    if kind == Yaw.kind:
+        return Yaw(dimension, vector, angles)
+    return Axis(dimension, vector) if kind == Axis.kind else Pose(dimension)
+
+
+def _three(name: str, values: Sequence[float], valid: str) -> tuple[float, float, float]:
+    if len(values) != 3:
+        raise ParameterError(name, tuple(values), valid)
+    return (float(values[0]), float(values[1]), float(values[2]))
 
 
 def task_from_json(data: dict[str, Any]) -> TaskSpace:
     """Reads what `TaskSpace.to_json` gave."""
-    return make_task(data["kind"], data["dimension"], data.get("rotation"))
+    return make_task(data["kind"], data["dimension"], data.get("rotation"), data.get("axis"))

@@ -1,0 +1,77 @@
+"""`grr-torch bench rotations`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+
+if TYPE_CHECKING:
+    from grr_torch.experiments.rotations import Result
+
+
+@reports_errors
+def rotations(
+    problem: Annotated[
+        list[str] | None,
+        typer.Option(help="'planar_5 pose', 'kinova yaw', 'kinova axis' or 'kinova pose'; repeatable; all by default."),
+    ] = None,
+    points: Annotated[int | None, typer.Option(help="Positions; the presets' by default.")] = None,
+    rotations: Annotated[int | None, typer.Option(help="Rotations at each; the presets' by default.")] = None,
+    refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Refine the roadmaps.")] = True,
+    reachability: Annotated[int, typer.Option(min=1, help="Random starts a vertex: which are reachable?")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+) -> None:
+    """Print the quality and the cost of roadmaps in which rotation varies, as a Markdown table.
+
+    Of the cells of each, a random 20,000 triangles and 20,000 squares stand for all. Takes some minutes.
+
+    Example: grr-torch bench rotations --problem "planar_5 pose"
+    """
+    from grr_torch.experiments.rotations import measure_rotations
+    from grr_torch.experiments.timing import machine
+    from grr_torch.output import atomic_write, check_writable
+
+    if json_file is not None:
+        check_writable(json_file)
+    with progress_bar() as progress:
+        results = measure_rotations(
+            problem,
+            points=points,
+            rotations=rotations,
+            refine=refine,
+            reachability=reachability,
+            seed=seed,
+            progress=progress,
+        )
+    if json_file is not None:
+        with atomic_write(json_file) as path:
+            data = {"machine": machine(), "roadmaps": [result.to_dict() for result in results]}
+            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
+    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    head = ["problem", "positions × rotations", "resolved / reachable", "connected / edges", "smoothness [rad/m]"]
+    head += ["certified triangles", "certified squares", "time [s]", "peak memory [MiB]"]
+    typer.echo(markdown_table(head, [_row(result) for result in results]))
+
+
+def _row(result: Result) -> list[str]:
+    quality = result.quality
+    return [
+        f"{result.problem}{', refined' if result.refined else ''}",
+        f"{result.positions:,} × {result.rotations:,}",
+        f"{quality.resolved_vertices:,} / {quality.reachable_vertices:,} ({_share(quality.coverage)})",
+        f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({_share(quality.connectivity)})",
+        "none" if quality.smoothness is None else f"{quality.smoothness:.2f}",
+        _share(quality.triangles_certified),
+        _share(quality.squares_certified),
+        f"{result.seconds:.1f}",
+        f"{result.memory:,.0f}",
+    ]
+
+
+def _share(value: float | None) -> str:
+    return "" if value is None else f"{100.0 * value:.2f} %"
