@@ -18,6 +18,7 @@ from grr_torch.progress import Progress, silent
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
 from grr_torch.spaces.configuration import average, difference, embed
+from grr_torch.spaces.graph import find_lattice
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -78,13 +79,13 @@ class Solver:
         points = roadmap.points[:, : self.task.dimension]
         self.points, self.configurations, self.vertices = roadmap.points, roadmap.configurations, vertices
         self.low, self.high = points.amin(0), points.amax(0)
-        lengths = (points[roadmap.edges[:, 0]] - points[roadmap.edges[:, 1]]).norm(dim=1)
-        self.radius = float(lengths.max()) if len(lengths) else math.inf
-        self._tree = cKDTree(points[vertices].numpy())
+        self.radius = roadmap.longest_edge
+        # a balanced tree takes twice as long to make and is no faster here
+        self._tree = cKDTree(points[vertices].numpy(), balanced_tree=False)
         self._embedded = embed(roadmap.configurations[vertices], self.robot.continuous.cpu())
-        self._ends = _neighbour_table(roadmap, vertices)
-        self._joined = _neighbour_matrix(self._ends) if len(vertices) <= _MATRIX else None
-        self._lattice = roadmap.graph.lattice
+        self._neighbours = roadmap.neighbours
+        self._joined = _neighbour_matrix(roadmap, vertices) if len(vertices) <= _MATRIX else None
+        self._lattice = find_lattice(roadmap.points)
         self._suspect = self._uncertified_places(roadmap)
 
     def __call__(self, points: Tensor, *, progress: Progress = silent) -> Solution:
@@ -185,13 +186,23 @@ class Solver:
         if self._joined is not None:
             paths = self._joined[nearest[:, :, None], nearest[:, None, :]].float()
         else:
-            near = nearest.to(torch.int32)
-            paths = (self._ends[nearest][..., None] == near[:, None, None, :]).any(2).float()
+            near = self.vertices[nearest].to(torch.int32)
+            paths = (self._ends(near)[..., None] == near[:, None, None, :]).any(2).float()
         paths.diagonal(dim1=1, dim2=2).fill_(1.0)
         for _ in range(math.ceil(math.log2(max(k, 2)))):
             paths = (paths @ paths).clamp_max_(1.0)
         sizes = paths.sum(2) * k - torch.arange(k)
         return paths[torch.arange(len(paths)), sizes.argmax(1)]
+
+    def _ends(self, vertices: Tensor) -> Tensor:
+        """(N, k, D) neighbours along connected edges of vertices (N, k); −1 where there are fewer."""
+        starts, ends = self._neighbours
+        first = starts[vertices]
+        counts = starts[vertices + 1] - first
+        column = torch.arange(max(1, int(counts.max()) if counts.numel() else 1))
+        index = (first[..., None] + column).clamp_max_(max(len(ends) - 1, 0))
+        found = ends[index] if len(ends) else torch.zeros_like(index, dtype=torch.int32)
+        return found.masked_fill_(column >= counts[..., None], -1)
 
     def _place(self, positions: Tensor, nearest: Tensor) -> Tensor:
         """Where in the table of suspects points are looked up: their pyramids in a grid, else their nearest vertex."""
@@ -215,22 +226,12 @@ class Solver:
         return suspect
 
 
-def _neighbour_matrix(ends: Tensor) -> Tensor:
-    """(R, R) bool from a neighbour table (R, D): twice as fast to look up, where it is not too large."""
-    joined = torch.zeros(len(ends), len(ends) + 1, dtype=torch.bool)
-    joined.scatter_(1, torch.where(ends < 0, len(ends), ends).long(), True)
-    return joined[:, :-1].contiguous()
-
-
-def _neighbour_table(roadmap: Roadmap, vertices: Tensor) -> Tensor:
-    """(R, D) neighbours along connected edges, by rank among the resolved vertices; −1 where there are fewer."""
+def _neighbour_matrix(roadmap: Roadmap, vertices: Tensor) -> Tensor:
+    """(R, R) bool, which resolved vertices a connected edge joins: faster to look up, where it is not too large."""
     rank = torch.full((len(roadmap.points),), -1)
     rank[vertices] = torch.arange(len(vertices))
-    edges = rank[roadmap.edges[roadmap.connected]]
-    both = torch.cat([edges, edges.flip(1)])
-    both = both[both[:, 0].argsort(stable=True)]
-    counts = both[:, 0].bincount(minlength=len(vertices))
-    table = torch.full((len(vertices), max(1, int(counts.max()) if len(both) else 1)), -1, dtype=torch.int32)
-    column = torch.arange(len(both)) - (counts.cumsum(0) - counts)[both[:, 0]]
-    table[both[:, 0], column] = both[:, 1].to(torch.int32)
-    return table
+    first, second = rank[roadmap.edges[roadmap.connected]].T
+    joined = torch.zeros(len(vertices), len(vertices), dtype=torch.bool)
+    joined[first, second] = True
+    joined[second, first] = True
+    return joined
