@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import grr_torch
-from grr_torch.resolution.cells import triangles
+from grr_torch.resolution.cells import find_triangles
 from grr_torch.resolution.quality import edge_slopes, steep_edges
 from grr_torch.spaces.graph import TaskGraph, find_lattice, staggered_grid
 
@@ -29,7 +29,7 @@ def test_triangles_are_all_there_are(vertices, seed, density):
         for corners in itertools.combinations(range(vertices), 3)
         if all(pair in there for pair in itertools.combinations(corners, 2))
     }
-    found = [tuple(corners) for corners in triangles(edges, vertices).tolist()]
+    found = [tuple(corners) for corners in find_triangles(edges, vertices).tolist()]
     assert len(found) == len(set(found))
     assert set(found) == expected
 
@@ -37,7 +37,7 @@ def test_triangles_are_all_there_are(vertices, seed, density):
 def test_a_grid_has_twelve_triangles_and_shares_six_faces_a_cell():
     graph = staggered_grid([(0.0, 1.0)] * 3, 300)
     cells = math.prod(graph.lattice.cells)
-    assert len(triangles(graph.edges, len(graph.points))) == 12 * cells
+    assert len(find_triangles(graph.edges, len(graph.points))) == 12 * cells
     faces = graph.lattice.faces()
     c = graph.lattice.cells[0]
     assert graph.lattice.cells == (c, c, c)

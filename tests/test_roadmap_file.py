@@ -230,13 +230,13 @@ def test_parsing_no_xml_gives_the_same_urdf(box_arm):
 
 
 @pytest.mark.parametrize("shape", [(0,), (0, 3), (5,), (4, 7), (3, 0)])
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.int64, torch.int32, torch.bool])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.int64, torch.int32, torch.uint8, torch.bool])
 def test_what_is_written_is_what_the_library_reads(tmp_path, generator, shape, dtype):
     tensor = (10.0 * torch.rand(shape, generator=generator)).to(dtype)
     tensors = {"a": tensor, "turned": tensor.T if tensor.ndim == 2 else tensor.flip(0), "b": torch.ones(3).bool()}
     write_tensors(tmp_path / "t.safetensors", tensors, {"key": "välue"})
     assert header(tmp_path / "t.safetensors") == {"key": "välue"}
-    for again in (load_file(tmp_path / "t.safetensors"), read_tensors(tmp_path / "t.safetensors")[1]):
+    for again in (load_file(tmp_path / "t.safetensors"), read_tensors(tmp_path / "t.safetensors", "tensors")[1]):
         assert all(torch.equal(again[name], tensor) for name, tensor in tensors.items())
     assert tensor_hash(tensors["turned"]) == tensor_hash(again["turned"])
 

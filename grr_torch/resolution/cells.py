@@ -20,6 +20,7 @@ from torch import Tensor
 
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.spaces.configuration import difference, distance
 
 if TYPE_CHECKING:
@@ -31,7 +32,9 @@ if TYPE_CHECKING:
 LARGEST_SPREAD = 1.0
 # projections on the way from a corner to the centre
 _STEPS = 8
-_CELLS_AT_ONCE = 8192
+CELLS_AT_ONCE = 8192
+# edges or faces that are looked at together
+_EDGES_AT_ONCE = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -65,42 +68,60 @@ class Cells:
         return ~self.wound & ~self.spread_out
 
 
-def measure_cells(roadmap: Roadmap, corners: Tensor, progress: Progress = silent) -> Cells:
+def measure_cells(roadmap: Roadmap, corners: Tensor, progress: Progress = silent, kept: Stage = UNKEPT) -> Cells:
     """Winding and spread of cells given by their corners (C, k)."""
-    robot = roadmap.robot
-    wraps = robot.continuous.cpu()
-    q = roadmap.configurations[corners]
-    turns = difference(q, q.roll(-1, dims=1), wraps).sum(1) / (2.0 * math.pi)
-    return Cells(corners, torch.where(wraps, turns.round(), 0.0).to(torch.int64), _spread(roadmap, corners, progress))
+    robot, tolerances = roadmap.robot, Tolerances(**roadmap.parameters["tolerances"])
+    points, q = (part.to(robot.lower) for part in (roadmap.points, roadmap.configurations))
+    spread = spreads(robot, roadmap.task, points, q, corners, tolerances, progress, kept)
+    return Cells(corners, windings(roadmap, corners), spread.cpu())
 
 
-def triangles(edges: Tensor, vertices: int) -> Tensor:
+def windings(roadmap: Roadmap, corners: Tensor) -> Tensor:
+    """(C, n) turns that each joint makes once round cells (C, k); only continuous joints can make any."""
+    wraps = roadmap.robot.continuous.cpu()
+    turns = torch.empty(len(corners), roadmap.robot.n, dtype=torch.int8)
+    for start in range(0, len(corners), CELLS_AT_ONCE):
+        part = slice(start, start + CELLS_AT_ONCE)
+        q = roadmap.configurations[corners[part]]
+        angles = difference(q, q.roll(-1, dims=1), wraps).sum(1)
+        turns[part] = torch.where(wraps, (angles / (2.0 * math.pi)).round(), 0.0).to(torch.int8)
+    return turns
+
+
+def find_triangles(edges: Tensor, vertices: int) -> Tensor:
     """(C, 3) all triangles of a graph, smallest vertex first.
 
     Args:
         edges: (E, 2) edges.
         vertices: How many vertices there are.
     """
-    edges = edges.sort(dim=1).values
-    keys, order = (edges[:, 0] * vertices + edges[:, 1]).sort()
-    first, second = edges[order].unbind(1)
-    starts = torch.searchsorted(first.contiguous(), torch.arange(vertices + 1))
-    # of every edge (a, b), the edges (a, c) with c > b: is (b, c) one too?
-    counts = starts[first + 1] - torch.arange(len(first)) - 1
-    edge = torch.repeat_interleave(torch.arange(len(first)), counts)
-    beyond = edge + 1 + torch.arange(len(edge)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
-    closed = _are_edges(keys, second[edge] * vertices + second[beyond])
-    edge, beyond = edge[closed], beyond[closed]
-    return torch.stack([first[edge], second[edge], second[beyond]], dim=1)
+    first, second = edges.amin(1), edges.amax(1)
+    keys, order = (first * vertices + second).sort()
+    first, second = first[order], second[order]
+    starts = torch.searchsorted(first, torch.arange(vertices + 1))
+    found: list[Tensor] = [edges.new_empty(0, 3)]
+    for part in torch.arange(len(keys)).split(_EDGES_AT_ONCE):
+        # of every edge (a, b), the edges (a, c) with c > b: is (b, c) one too?
+        counts = starts[first[part] + 1] - part - 1
+        edge = torch.repeat_interleave(part, counts)
+        beyond = edge + 1 + torch.arange(len(edge)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
+        closed = _are_edges(keys, second[edge] * vertices + second[beyond])
+        edge, beyond = edge[closed], beyond[closed]
+        found.append(torch.stack([first[edge], second[edge], second[beyond]], dim=1))
+    return torch.cat(found)
 
 
-def squares(roadmap: Roadmap) -> Tensor:
+def find_squares(roadmap: Roadmap) -> Tensor:
     """(C, 4) faces of a staggered grid in space all of whose edges are connected; none for other graphs."""
     lattice, vertices = roadmap.graph.lattice, len(roadmap.points)
     faces = torch.empty(0, 4, dtype=torch.long) if lattice is None else lattice.faces()
     keys = (roadmap.edges[roadmap.connected] @ torch.tensor([vertices, 1])).sort().values
-    ends = torch.stack([faces, faces.roll(-1, dims=1)], dim=-1).sort(dim=-1).values
-    return faces[_are_edges(keys, ends @ torch.tensor([vertices, 1])).all(1)]
+    found: list[Tensor] = [faces[:0]]
+    for part in faces.split(_EDGES_AT_ONCE):
+        following = part.roll(-1, dims=1)
+        wanted = torch.minimum(part, following) * vertices + torch.maximum(part, following)
+        found.append(part[_are_edges(keys, wanted).all(1)])
+    return torch.cat(found)
 
 
 def _are_edges(keys: Tensor, wanted: Tensor) -> Tensor:
@@ -110,8 +131,48 @@ def _are_edges(keys: Tensor, wanted: Tensor) -> Tensor:
     return keys[torch.searchsorted(keys, wanted).clamp(max=len(keys) - 1)] == wanted
 
 
+def spreads(
+    robot: Robot,
+    task: TaskSpace,
+    points: Tensor,
+    q: Tensor,
+    corners: Tensor,
+    tolerances: Tolerances,
+    progress: Progress = silent,
+    kept: Stage = UNKEPT,
+) -> Tensor:
+    """The spread (C,) of cells, as in `Cells`.
+
+    Args:
+        robot: The robot.
+        task: The task space.
+        points: (V, width) points.
+        q: (V, n) configurations there.
+        corners: (C, k) cells.
+        tolerances: Of the projections.
+        progress: Told how many cells are done.
+        kept: Where it is kept how far that is.
+    """
+    count = len(corners)
+    spread = q.new_empty(count)
+    state = kept.state()
+    done = int(state["done"]) if state else 0
+    spread[:done] = state["spread"].to(spread) if state else spread[:0]
+    pairs = torch.combinations(torch.arange(corners.shape[1], device=q.device))
+    for start in range(done, count, CELLS_AT_ONCE):
+        progress("measuring cells", start, count)
+        part = corners[start : start + CELLS_AT_ONCE].to(q.device)
+        ends, followed = lead_to_centres(robot, task, points[part], q[part], tolerances)
+        apart = distance(ends[:, pairs[:, 0]], ends[:, pairs[:, 1]], robot.continuous).amax(1)
+        end = start + len(part)
+        spread[start:end] = torch.where(followed, apart, torch.inf)
+        kept.keep({"spread": spread[:end], "done": torch.tensor(end)}, last=end == count)
+    progress("measuring cells", count, count)
+    return spread
+
+
 def lead_to_centres(
-    robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress = silent
+    robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances
 ) -> tuple[Tensor, Tensor]:
     """Follows the straight lines from the corners of cells to their centres.
 
@@ -121,22 +182,10 @@ def lead_to_centres(
         points: (C, k, width) corners.
         q: (C, k, n) configurations there.
         tolerances: Of the projections.
-        progress: Told how many cells are done.
 
     Returns:
         Configurations (C, k, n) at the centres, and where all corners of a cell led to one (C,).
     """
-    count = len(points)
-    ends, followed = torch.empty_like(q), torch.empty(count, dtype=torch.bool, device=q.device)
-    for start in range(0, count, _CELLS_AT_ONCE):
-        progress("measuring cells", start, count)
-        part = slice(start, start + _CELLS_AT_ONCE)
-        ends[part], followed[part] = _lead(robot, task, points[part], q[part], tolerances)
-    progress("measuring cells", count, count)
-    return ends, followed
-
-
-def _lead(robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances) -> tuple[Tensor, Tensor]:
     count, sides, _ = points.shape
     centre = points.mean(1, keepdim=True).expand_as(points)
     columns = q.reshape(-1, robot.n).T.contiguous()
@@ -147,12 +196,3 @@ def _lead(robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: 
         followed &= valid
         columns = torch.where(valid, solved, columns)
     return columns.T.reshape(count, sides, robot.n), followed.reshape(count, sides).all(1)
-
-
-def _spread(roadmap: Roadmap, corners: Tensor, progress: Progress) -> Tensor:
-    robot, tolerances = roadmap.robot, Tolerances(**roadmap.parameters["tolerances"])
-    points, q = (part[corners].to(robot.lower) for part in (roadmap.points, roadmap.configurations))
-    ends, followed = lead_to_centres(robot, roadmap.task, points, q, tolerances, progress)
-    pairs = torch.combinations(torch.arange(corners.shape[1], device=q.device))
-    apart = distance(ends[:, pairs[:, 0]], ends[:, pairs[:, 1]], robot.continuous).amax(1)
-    return torch.where(followed, apart, torch.inf).cpu()

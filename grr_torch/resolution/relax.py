@@ -20,6 +20,7 @@ from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress
 from grr_torch.projection.columns import null_space_projector, transposed_product
 from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.objectives import Objective
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import difference, normalise
@@ -128,14 +129,25 @@ class Pulls(NamedTuple):
     weights: Tensor
 
 
-def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progress, rounds: int = _ROUNDS) -> Tensor:
+def relax(
+    network: Network,
+    q: Tensor,
+    tolerances: Tolerances,
+    progress: Progress,
+    rounds: int = _ROUNDS,
+    kept: Stage = UNKEPT,
+) -> Tensor:
     """Configurations (n, V) of lower cost: converged, within limits and free of self-collision like those given."""
     parts = network.parts if network.parts is not None else torch.zeros_like(network.targets[0], dtype=torch.long)
     costs = network.costs(q)
     damping = torch.full_like(costs, 1e-2)
     going_on = torch.ones_like(costs, dtype=torch.bool)
+    begin = 0
+    if state := kept.state():
+        q, costs, damping, going_on = (state[name].to(q.device) for name in ("q", "costs", "damping", "going_on"))
+        begin = int(state["done"]) if bool(going_on.any()) else rounds
     with one_thread(), torch.no_grad():
-        for done in range(rounds):
+        for done in range(begin, rounds):
             progress("refining", done, rounds)
             moved = move(network, q, gauss_newton_step(network, q, damping[parts]), tolerances)
             new_costs = network.costs(moved)
@@ -143,7 +155,10 @@ def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progres
             going_on = torch.where(better, new_costs < (1.0 - _LEAST_GAIN) * costs, going_on & (damping <= 1e2))
             q, costs = torch.where(better[parts], moved, q), torch.where(better, new_costs, costs)
             damping = torch.where(better, (0.3 * damping).clamp_min(1e-4), 10.0 * damping)
-            if not bool(going_on.any()):
+            last = done + 1 == rounds or not bool(going_on.any())
+            state = {"q": q, "costs": costs, "damping": damping, "going_on": going_on, "done": torch.tensor(done + 1)}
+            kept.keep(state, last=last)
+            if last:
                 break
     progress("refining", rounds, rounds)
     return q

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from grr_torch.progress import Progress, silent
-from grr_torch.resolution.cells import Cells, measure_cells, squares, triangles
+from grr_torch.resolution.cells import Cells, find_squares, find_triangles, measure_cells
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.quality import Quality, measure_quality
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import TaskGraph, find_lattice
@@ -89,10 +90,20 @@ class Roadmap:
         Args:
             progress: Told how many cells are measured.
         """
-        if "cells" not in self._measured:
-            corners = triangles(self.edges[self.connected], len(self.points)), squares(self)
-            self._measured["cells"] = tuple(measure_cells(self, part, progress) for part in corners)
-        return self._measured["cells"]
+        return self.triangles(progress), self.squares(progress)
+
+    def triangles(self, progress: Progress = silent, kept: Stage = UNKEPT) -> Cells:
+        """The first of `cells`, measured once; `kept` is where it is kept how far that is."""
+        if "triangles" not in self._measured:
+            corners = find_triangles(self.edges[self.connected], len(self.points))
+            self._measured["triangles"] = measure_cells(self, corners, progress, kept)
+        return self._measured["triangles"]
+
+    def squares(self, progress: Progress = silent, kept: Stage = UNKEPT) -> Cells:
+        """The second of `cells`, measured once; `kept` is where it is kept how far that is."""
+        if "squares" not in self._measured:
+            self._measured["squares"] = measure_cells(self, find_squares(self), progress, kept)
+        return self._measured["squares"]
 
     @cached_property
     def _measured(self) -> dict[str, Any]:

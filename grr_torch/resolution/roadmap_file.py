@@ -80,8 +80,8 @@ def solving_tables(roadmap: Roadmap) -> dict[str, Tensor]:
     return dict(zip(_TABLES, (*roadmap.neighbours, *roadmap.uncertified), strict=True))
 
 
-def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
-    """Reads a roadmap; see `Roadmap.load`."""
+def load_roadmap(path: str | os.PathLike[str], robot: Robot | None = None) -> Roadmap:
+    """Reads a roadmap; see `Roadmap.load`. A `robot` may be given in place of the file's, as which it was checked."""
     metadata, tensors = read_file(path)
     _check_tensors(path, tensors)
     try:
@@ -91,7 +91,7 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
         for name, hint in get_type_hints(Quality).items():
             if not isinstance(metadata["quality"][name], hint):
                 raise FileFormatError(path, f"has a quality figure '{name}' that is no such number")
-        robot = _robot_from_json(metadata["robot"])
+        robot = robot or _robot_from_json(metadata["robot"])
         task = task_from_json(metadata["task"])
         parameters, seconds = dict(metadata["parameters"]), float(metadata["build_seconds"])
         longest = float(metadata["longest_edge"])
@@ -133,7 +133,7 @@ def read_file(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, T
     Raises:
         FileFormatError: It is missing, truncated, of another version, or not a roadmap.
     """
-    header, tensors = read_tensors(path)
+    header, tensors = read_tensors(path, "a roadmap")
     if header.get("format") != json.dumps(FORMAT):
         raise FileFormatError(path, "is not a roadmap of grr-torch")
     try:

@@ -15,7 +15,14 @@ from torch import Tensor
 from grr_torch.errors import FileFormatError
 from grr_torch.output import atomic_write
 
-_NAMES = {torch.float64: "F64", torch.float32: "F32", torch.int64: "I64", torch.int32: "I32", torch.bool: "BOOL"}
+_NAMES = {
+    torch.float64: "F64",
+    torch.float32: "F32",
+    torch.int64: "I64",
+    torch.int32: "I32",
+    torch.uint8: "U8",
+    torch.bool: "BOOL",
+}
 # bytes that are written or hashed at once
 _AT_ONCE = 1 << 24
 
@@ -48,8 +55,12 @@ def write_tensors(
                 file.write(piece)
 
 
-def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, str], dict[str, Tensor]]:
+def read_tensors(path: str | os.PathLike[str], what: str) -> tuple[dict[str, str], dict[str, Tensor]]:
     """Metadata and tensors of a file. The tensors are mapped: of the file, only what is used is read.
+
+    Args:
+        path: The file.
+        what: What it should be, for errors.
 
     Raises:
         FileFormatError: It is missing, truncated or no such file.
@@ -61,7 +72,7 @@ def read_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, str], dict[str
             names = list(file.keys())
             return dict(file.metadata() or {}), {name: file.get_tensor(name) for name in names}
     except SafetensorError as error:
-        raise FileFormatError(path, f"is truncated or not a roadmap: {error}") from error
+        raise FileFormatError(path, f"is truncated or not {what}: {error}") from error
     except OSError as error:
         raise FileFormatError(path, f"cannot be read: {error}") from error
 
