@@ -17,6 +17,7 @@ from grr_torch.resolution.auto_seeds import CANDIDATES, find_seeds
 from grr_torch.resolution.checkpoint import Checkpoint, digest
 from grr_torch.resolution.edges import continuous_edges
 from grr_torch.resolution.expand import default_neighbours, expand
+from grr_torch.resolution.memory import require_memory
 from grr_torch.resolution.objectives import check_objectives
 from grr_torch.resolution.problem import Problem, pose_problem
 from grr_torch.resolution.random_grr import random_grr
@@ -85,13 +86,15 @@ def build(
         The roadmap; its `build_seconds` leave reachability out.
 
     Raises:
-        ParameterError: Something is missing or out of its range, or no point lies within the arm's reach.
+        ParameterError: Something is missing or out of its range, no point lies within the arm's reach, or the build
+            would not fit the memory that is free.
         SeedError: No seed can be used.
         FileFormatError: The checkpoint is of another build, or corrupt.
         OutputError: The checkpoint cannot be written, or is there without `resume`.
     """
     problem = pose_problem(robot, task, points, bounds, seeds)
     check_seed(seed)
+    require_memory(robot, problem, refine)
     check_objectives(robot, objectives)
     if objectives and not refine:
         raise ParameterError("objectives", tuple(objectives), "none without refinement, which serves them")
