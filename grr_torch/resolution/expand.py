@@ -113,6 +113,7 @@ def grow(
     embedded = configurations.new_zeros(count, 2 * robot.n)
     targets = graph.points.to(device=robot.device, dtype=robot.dtype).T.contiguous()
     candidates = within_reach(robot, task, graph.points).to(robot.device)
+    within = int(candidates.sum())
     waiting = torch.zeros_like(candidates)
     begin = 0
     if state := kept.state():
@@ -126,7 +127,7 @@ def grow(
         embedded[found] = embed(placed, robot.continuous)
         waiting[graph.around(found)[1]] = True
         frontier = (waiting & candidates).nonzero()[:, 0]
-        progress("expanding", int((wave >= 0).sum()), count)
+        progress("expanding", int((wave >= 0).sum()), within)
         guesses, known = _average(graph, embedded, frontier, neighbours, robot.continuous)
         # an edge may lead to a vertex that is not among the nearest; its end waits until one of these is resolved
         frontier = frontier[known]
@@ -136,6 +137,7 @@ def grow(
         state = {"configurations": configurations, "wave": wave, "waiting": waiting, "found": found, "placed": placed}
         kept.keep({**state, "next": torch.tensor(current + 1)}, last=len(frontier) == 0)
         if len(frontier) == 0:
+            progress("expanding", within, within)
             return Expansion(configurations, wave)
     raise AssertionError("unreachable")
 
