@@ -25,7 +25,7 @@ from grr_torch.resolution.reachability import measure_reachability
 from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.roadmap_file import load_roadmap, robot_to_json
-from grr_torch.resolution.seeds import SeedsLike
+from grr_torch.resolution.seeds import SeedsLike, check_seeds
 from grr_torch.resolution.tensor_file import tensor_hash
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph
@@ -93,18 +93,7 @@ def build(
         OutputError: The checkpoint cannot be written, or is there without `resume`.
     """
     problem = pose_problem(robot, task, points, bounds, seeds)
-    check_seed(seed)
-    require_memory(robot, problem, refine)
-    check_objectives(robot, objectives)
-    if objectives and not refine:
-        raise ParameterError("objectives", tuple(objectives), "none without refinement, which serves them")
-    if not 0 <= reachability <= _MOST_STARTS:
-        raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
-    if resume and checkpoint is None:
-        raise ParameterError("resume", resume, "with a checkpoint to resume from")
-    if method not in ("expansion", "random"):
-        raise UnknownNameError("method", method, ("expansion", "random"))
-    options = {
+    options: dict[str, Any] = {
         "method": method,
         "candidates": candidates,
         "neighbours": neighbours,
@@ -115,11 +104,14 @@ def build(
         "seed": seed,
         "tolerances": asdict(tolerances),
     }
-    kept = (
-        Checkpoint() if checkpoint is None else Checkpoint(checkpoint, describe_build(robot, problem, options), resume)
-    )
+    _check_options(robot, options)
+    if resume and checkpoint is None:
+        raise ParameterError("resume", resume, "with a checkpoint to resume from")
+    what = None if checkpoint is None else describe_build(robot, problem, options)
+    kept = Checkpoint(checkpoint, what, resume)
     if kept.roadmap is not None:
         return load_roadmap(kept.roadmap, robot)
+    require_memory(robot, problem, refine)
     with kept.timed("building"):
         if method == "random":
             parts = _at_random(robot, problem, samples, seed, tolerances, progress, kept)
@@ -140,12 +132,30 @@ def build(
     return roadmap
 
 
+def _check_options(robot: Robot, options: Mapping[str, Any]) -> None:
+    """Checks what `build` is asked for, whatever the problem.
+
+    Raises:
+        ParameterError: A parameter is out of its range, or does not go with another.
+        UnknownNameError: No such method or objective.
+    """
+    check_seed(options["seed"])
+    objectives, reachability, method = (options[name] for name in ("objectives", "reachability", "method"))
+    check_objectives(robot, objectives)
+    if objectives and not options["refine"]:
+        raise ParameterError("objectives", tuple(objectives), "none without refinement, which serves them")
+    if not 0 <= reachability <= _MOST_STARTS:
+        raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
+    if method not in ("expansion", "random"):
+        raise UnknownNameError("method", method, ("expansion", "random"))
+
+
 def describe_build(robot: Robot, problem: Problem, options: Mapping[str, Any]) -> dict[str, Any]:
     """All that determines a build, by name, as JSON: what is long, by its SHA-256."""
     arm = {
         name: value for name, value in robot_to_json(robot).items() if name not in ("urdf_directory", "package_dirs")
     }
-    seeds = problem.seeds if isinstance(problem.seeds, str) else tensor_hash(torch.as_tensor(problem.seeds))
+    seeds = problem.seeds if isinstance(problem.seeds, str) else tensor_hash(check_seeds(robot, problem.seeds).cpu())
     graph = {"points": tensor_hash(problem.graph.points), "edges": tensor_hash(problem.graph.edges)}
     packages = {"grr-torch": __version__, "torch": torch.__version__, "device": robot.device.type}
     what = {"robot": robot.name, "arm": digest(arm), "task": problem.task.to_json(), **graph, "seeds": seeds}
