@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from grr_torch.cli.bench_learning import learning
 from grr_torch.cli.bench_rotations import rotations
+from grr_torch.cli.bench_scale import scale
 from grr_torch.cli.bench_teleop import teleop
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
@@ -23,6 +24,7 @@ app = typer.Typer(name="bench", help="Measure: the tables of the README.", no_ar
 app.command()(teleop)
 app.command()(learning)
 app.command()(rotations)
+app.command()(scale)
 
 
 @app.callback()

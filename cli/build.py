@@ -83,12 +83,21 @@ def build(
     hold: Annotated[list[str] | None, typer.Option(help="Hold a joint still; repeatable.", metavar="J=VALUE")] = None,
     spheres: Annotated[Path | None, typer.Option(help="Sphere file for self-collision (grr-torch spheres).")] = None,
     margin: Annotated[float | None, typer.Option(help="Added to every self-collision check, in metres.")] = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(help="Folder in which it is kept what is done, so that a build that was killed can go on."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from what --checkpoint holds; an absent or empty one starts afresh.")
+    ] = False,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
 ) -> None:
     """Build a roadmap, print its quality, and write it with a recording of it.
 
     Example: grr-torch build --robot kinova --objective clearance=0.5 --objective limits=0.1
+
+    Example: grr-torch build --robot kinova --points 1000000 --no-record --checkpoint kinova_1m --resume
 
     Example: grr-torch build --robot arm.urdf --tool flange --task position --points 2000
     --bounds -0.8 0.8 -0.8 0.8 0 1.2 --seeds seeds.csv
@@ -136,6 +145,8 @@ def build(
             objectives=_weights(objective or []),
             reachability=reachability,
             seed=seed,
+            checkpoint=checkpoint,
+            resume=resume,
             progress=progress,
         )
         figures = roadmap.quality(progress)

@@ -53,19 +53,27 @@ def _show_warning(
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """A progress bar on standard error, gone when the work is done; silent where there is no terminal."""
+    """A bar for each stage on standard error, gone when the work is done; silent where there is no terminal.
+
+    What is left is extrapolated for the stage alone, from how fast it has been; stages may end early.
+    """
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    times = (TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times)
     with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         tasks: dict[str, Any] = {}
+        reported: dict[str, int] = {}
 
         def report(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=total)
+            elif done < reported[stage]:
+                bar.reset(tasks[stage])  # it is done once more, or goes on from a checkpoint: its speed is another
+            reported[stage] = done
             bar.update(tasks[stage], completed=done, total=total)
 
         yield report

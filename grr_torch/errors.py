@@ -9,10 +9,21 @@ import difflib
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 
 class GrrError(Exception):
     """Base class of every error that bad input to grr_torch raises."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """As it is: its message is not what it is made from. Errors pass between processes."""
+        return _remake, (type(self), self.args), vars(self)
+
+
+def _remake(kind: type[GrrError], arguments: tuple[Any, ...]) -> GrrError:
+    error = kind.__new__(kind)
+    error.args = arguments
+    return error
 
 
 class GrrWarning(UserWarning):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 
 import numpy as np
 import pytest
@@ -14,8 +15,11 @@ import grr_torch
 from grr_torch.errors import FileFormatError, GrrError, OutputError
 from grr_torch.output import atomic_write
 from grr_torch.resolution.verify import verify_file
+from grr_torch.robots.urdf_json import urdf_from_json, urdf_to_json
+from grr_torch.tensor_file import read_tensors, tensor_hash, write_tensors
 
 TENSORS = ("points", "configurations", "resolved", "edges", "connected", "wave", "reachable")
+TABLES = ("neighbour_starts", "neighbour_ends", "uncertified_triangles", "uncertified_squares")
 
 
 @pytest.fixture
@@ -67,9 +71,9 @@ def test_it_loads_without_the_urdf(box_arm, tmp_path):
 
 
 def test_the_file_names_its_tensors_and_origin(saved):
-    assert set(load_file(saved)) == set(TENSORS)
+    assert set(load_file(saved)) == {*TENSORS, *TABLES}
     metadata = {name: json.loads(value) for name, value in header(saved).items()}
-    assert metadata["format_version"] == 2
+    assert metadata["format_version"] == 3
     assert metadata["package_version"] == grr_torch.__version__
     assert metadata["robot"]["tool"] == "tool"
     assert len(metadata["robot"]["urdf_sha256"]) == 64
@@ -136,10 +140,8 @@ def damage(saved, how):
         tensors["resolved"] = tensors["resolved"][:-1]
     elif how == "dtype":
         tensors["points"] = tensors["points"].float()
-    elif how == "edges":
-        tensors["edges"][0, 0] = 10_000
-    elif how == "nan":
-        tensors["configurations"][int(tensors["resolved"].nonzero()[0, 0])] = torch.nan
+    elif how == "table":
+        tensors["uncertified_triangles"] = tensors["uncertified_triangles"][:, :2].contiguous()
     elif how == "columns":
         tensors["configurations"] = tensors["configurations"][:, :3].contiguous()
     save_file(tensors, saved, metadata=metadata)
@@ -149,7 +151,7 @@ DAMAGES = {
     "truncated": "truncated",
     "text": "truncated or not a roadmap",
     "empty": "truncated or not a roadmap",
-    "version": "format version 99; this version reads 2",
+    "version": "format version 99; this version reads 3",
     "foreign": "not a roadmap of grr-torch",
     "metadata": "cannot be read",
     "robot": "metadata without .urdf_directory.",
@@ -158,9 +160,8 @@ DAMAGES = {
     "missing": "lacks the tensors wave",
     "short": "'resolved' has",
     "dtype": "'points' is torch.float32",
-    "edges": "vertices that do not exist",
-    "nan": "without a finite configuration",
     "columns": "rows of",
+    "table": "'uncertified_triangles' has rows of 2, not 3",
 }
 
 
@@ -170,6 +171,87 @@ def test_a_damaged_file_is_a_clear_error(saved, how):
     with pytest.raises(FileFormatError, match=DAMAGES[how]) as caught:
         grr_torch.Roadmap.load(saved)
     assert caught.value.path == saved
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("edges", 10_000, "vertices that do not exist"),
+        ("configurations", torch.nan, "without a finite configuration"),
+        ("points", torch.inf, "points that are not finite"),
+        ("wave", -1, "waves that do not fit"),
+    ],
+)
+def test_contents_that_contradict_each_other_are_found_when_asked_for(saved, name, value, reason):
+    tensors, metadata = load_file(saved), header(saved)
+    row = 0 if name == "edges" else int(tensors["resolved"].nonzero()[0, 0])
+    tensors[name][row] = value
+    save_file(tensors, saved, metadata=metadata)
+    checks = {check.name: check for check in verify_file(saved)}
+    assert reason in checks["contents"].detail
+    assert {name for name, check in checks.items() if not check.passed} == {"tensors", "contents"}
+    assert name in checks["tensors"].detail
+
+
+@pytest.mark.parametrize("name", ["neighbour_ends", "uncertified_triangles"])
+def test_edited_tables_are_caught(saved, name):
+    tensors, metadata = load_file(saved), header(saved)
+    tensors[name] = tensors[name].flip(0)
+    save_file(tensors, saved, metadata=metadata)
+    assert {check.name for check in verify_file(saved) if not check.passed} == {"tensors", "tables"}
+
+
+def test_a_file_is_mapped_not_read(saved):
+    last = grr_torch.Roadmap.load(saved).resolved[-1:]
+    before = bool(last)
+    with saved.open("r+b") as file:
+        file.seek(-1, 2)
+        file.write(bytes([not before]))
+    assert bool(last) is not before, "what changes in the file changes in the tensor"
+
+
+def test_a_loaded_map_solves_as_the_one_that_was_saved(planar_roadmap, saved, generator):
+    points = 1.2 * (torch.rand(500, 2, dtype=torch.float64, generator=generator) - 0.5)
+    again = grr_torch.Roadmap.load(saved)
+    first, second = planar_roadmap.solve(points), again.solve(points)
+    assert torch.equal(first.configurations.nan_to_num(9.9), second.configurations.nan_to_num(9.9))
+    assert (first.status == second.status).all()
+    assert "_measured" not in vars(again) or "cells" not in vars(again)["_measured"], "no cell was measured for it"
+
+
+def test_parsing_no_xml_gives_the_same_urdf(box_arm):
+    for robot in (grr_torch.load_robot("kinova"), grr_torch.load_robot(box_arm)):
+        urdf = robot.urdf
+        again = urdf_from_json(
+            json.loads(json.dumps(urdf_to_json(urdf))), text=urdf.text, directory=urdf.directory, package_dirs=[]
+        )
+        assert urdf_to_json(again) == urdf_to_json(urdf)
+        assert (again.links, again.root, again.leaves()) == (urdf.links, urdf.root, urdf.leaves())
+
+
+@pytest.mark.parametrize("shape", [(0,), (0, 3), (5,), (4, 7), (3, 0)])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.int64, torch.int32, torch.uint8, torch.bool])
+def test_what_is_written_is_what_the_library_reads(tmp_path, generator, shape, dtype):
+    tensor = (10.0 * torch.rand(shape, generator=generator)).to(dtype)
+    tensors = {"a": tensor, "turned": tensor.T if tensor.ndim == 2 else tensor.flip(0), "b": torch.ones(3).bool()}
+    write_tensors(tmp_path / "t.safetensors", tensors, {"key": "välue"})
+    assert header(tmp_path / "t.safetensors") == {"key": "välue"}
+    for again in (load_file(tmp_path / "t.safetensors"), read_tensors(tmp_path / "t.safetensors", "tensors")[1]):
+        assert all(torch.equal(again[name], tensor) for name, tensor in tensors.items())
+    assert tensor_hash(tensors["turned"]) == tensor_hash(again["turned"])
+
+
+def test_a_full_disk_is_a_clear_error_and_leaves_the_old_file(planar_roadmap, saved):
+    before = saved.read_bytes()
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limit[1]))
+    try:
+        with pytest.raises(OutputError, match=f"cannot write {saved}: "):
+            planar_roadmap.save(saved)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert saved.read_bytes() == before
+    assert list(saved.parent.iterdir()) == [saved]
 
 
 def test_a_missing_file_is_a_clear_error(tmp_path):

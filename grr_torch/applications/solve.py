@@ -19,6 +19,7 @@ from grr_torch.progress import Progress, silent
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
 from grr_torch.spaces.configuration import average, difference, embed
+from grr_torch.spaces.graph import find_lattice
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -79,20 +80,19 @@ class Solver:
         self.low = points.amin(0)
         slack = 1e-9
         self._low, self._high = self.low.numpy() - slack, points.amax(0).numpy() + slack
-        lengths = (points[roadmap.edges[:, 0]] - points[roadmap.edges[:, 1]]).norm(dim=1)
-        self.radius = float(lengths.max()) if len(lengths) else math.inf
+        self.radius = roadmap.longest_edge
         turning = self.task.rotations is not None
         self._around = (AroundProduct if turning else Around)(roadmap, vertices, self.radius)
         self._continuous = self.robot.continuous.cpu()
         self._embedded = embed(roadmap.configurations[vertices], self._continuous)
-        ends = _neighbour_table(roadmap, vertices)
-        self._ends = ends.numpy()
-        self._joined = _neighbour_matrix(ends).numpy() if len(vertices) <= _MATRIX else None
+        self._neighbours = tuple(part.numpy() for part in roadmap.neighbours)
+        self._joined = _neighbour_matrix(roadmap, vertices).numpy() if len(vertices) <= _MATRIX else None
         # where rotation varies, suspects are looked up by their nearest vertices
-        self._lattice = roadmap.graph.lattice
+        self._lattice = None if turning else find_lattice(roadmap.points)
         self._suspect = self._uncertified_places(roadmap)
-        if self._suspect is not None:
-            self._near_suspect = self._near_uncertified(roadmap)
+        # of a large roadmap, such a table would take long to make
+        small = self._suspect is not None and len(vertices) <= _MATRIX
+        self._near_suspect = self._near_uncertified(roadmap) if small else None
 
     def __call__(self, points: Tensor, *, progress: Progress = silent) -> Solution:
         """`Roadmap.solve`."""
@@ -190,7 +190,8 @@ class Solver:
         if self._joined is not None:
             joined = self._joined.take(nearest[:, :, None] * len(self.vertices) + nearest[:, None, :])
         else:
-            joined = (self._ends[nearest][..., None] == nearest[:, None, None, :]).any(2)
+            near = self.vertices.numpy()[nearest]
+            joined = (self._ends(near)[..., None] == near[:, None, None, :]).any(2)
         bits = 1 << np.arange(k)
         counted = counts @ bits
         around = np.where(counts, (joined @ bits | bits) & counted[:, None], 0)
@@ -209,11 +210,24 @@ class Solver:
             part[left] = np.take_along_axis(closed, sizes.argmax(1)[:, None], axis=1)[:, 0]
         return part[:, None] & bits != 0
 
+    def _ends(self, vertices: NDArray[Any]) -> NDArray[Any]:
+        """(N, k, D) neighbours along connected edges of vertices (N, k); −1 where there are fewer."""
+        starts, ends = self._neighbours
+        first = starts[vertices]
+        counts = starts[vertices + 1] - first
+        column = np.arange(max(1, int(counts.max()) if counts.size else 1))
+        if len(ends) == 0:
+            return np.full((*vertices.shape, 1), -1)
+        index = np.minimum(first[..., None] + column, len(ends) - 1)
+        return np.where(column < counts[..., None], ends[index], -1)
+
     def _mark_uncertified(self, codes: NDArray[np.uint8], positions: NDArray[Any], nearest: NDArray[Any]) -> None:
         """Sets the codes of points in uncertified cells: by their pyramids in a grid, else by their nearest vertex."""
         if self._suspect is None:
             return
-        rows = self._near_suspect[nearest].nonzero()[0]
+        rows = np.arange(len(nearest))
+        if self._near_suspect is not None:
+            rows = self._near_suspect[nearest].nonzero()[0]
         if self._lattice is not None and len(rows):
             places = self._lattice.pyramids(torch.from_numpy(positions[rows]) - self.low)
             rows = rows[self._suspect[places].numpy()]
@@ -249,22 +263,12 @@ class Solver:
         return suspect
 
 
-def _neighbour_matrix(ends: Tensor) -> Tensor:
-    """(R, R) bool from a neighbour table (R, D): twice as fast to look up, where it is not too large."""
-    joined = torch.zeros(len(ends), len(ends) + 1, dtype=torch.bool)
-    joined.scatter_(1, torch.where(ends < 0, len(ends), ends).long(), True)
-    return joined[:, :-1].contiguous()
-
-
-def _neighbour_table(roadmap: Roadmap, vertices: Tensor) -> Tensor:
-    """(R, D) neighbours along connected edges, by rank among the resolved vertices; −1 where there are fewer."""
+def _neighbour_matrix(roadmap: Roadmap, vertices: Tensor) -> Tensor:
+    """(R, R) bool, which resolved vertices a connected edge joins: faster to look up, where it is not too large."""
     rank = torch.full((len(roadmap.points),), -1)
     rank[vertices] = torch.arange(len(vertices))
-    edges = rank[roadmap.edges[roadmap.connected]]
-    both = torch.cat([edges, edges.flip(1)])
-    both = both[both[:, 0].argsort(stable=True)]
-    counts = both[:, 0].bincount(minlength=len(vertices))
-    table = torch.full((len(vertices), max(1, int(counts.max()) if len(both) else 1)), -1, dtype=torch.int32)
-    column = torch.arange(len(both)) - (counts.cumsum(0) - counts)[both[:, 0]]
-    table[both[:, 0], column] = both[:, 1].to(torch.int32)
-    return table
+    first, second = rank[roadmap.edges[roadmap.connected]].T
+    joined = torch.zeros(len(vertices), len(vertices), dtype=torch.bool)
+    joined[first, second] = True
+    joined[second, first] = True
+    return joined

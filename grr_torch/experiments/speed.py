@@ -19,7 +19,8 @@ from grr_torch.experiments.peers import (
     pytorch_kinematics_jacobian,
 )
 from grr_torch.experiments.projection_cost import AnyPose, PoseProblem
-from grr_torch.experiments.timing import in_fresh_process, machine, median_process_seconds, median_seconds
+from grr_torch.experiments.scale import measure_build
+from grr_torch.experiments.timing import machine, median_process_seconds, median_seconds
 from grr_torch.experiments.use_speed import measure_use
 from grr_torch.pieces import in_pieces
 from grr_torch.progress import Progress, silent
@@ -215,9 +216,10 @@ def _processes(bench: _Bench) -> Iterator[Row]:
 
 def _growth(bench: _Bench) -> Iterator[Row]:
     for points in GROWTH:
-        (vertices, seconds), peak = in_fresh_process(_grow, points, str(bench.robot.device))
-        more = {"s": seconds, "peak MiB of the process": peak}
-        yield Row(f"build, kinova position, {vertices:,} vertices", "µs a vertex", 1e6 * seconds / vertices, {}, more)
+        grown = measure_build("kinova", "position", points, refine=False, device=str(bench.robot.device))
+        more = {"s": grown.seconds, "peak MiB of the process": grown.peak_mib}
+        each = 1e6 * grown.seconds / grown.vertices
+        yield Row(f"build, kinova position, {grown.vertices:,} vertices", "µs a vertex", each, {}, more)
 
 
 def _use(bench: _Bench) -> Iterator[Row]:
@@ -227,14 +229,6 @@ def _use(bench: _Bench) -> Iterator[Row]:
     p99 = {"99th percentile": 1e3 * figures.step_p99}
     yield Row("teleoperation, one arm, paths of all kinds", "ms a step", 1e3 * figures.step_median, {}, p99)
     yield Row("teleoperation, 100 arms, random lines", "ms an arm and step", 1e3 * figures.arm_step)
-
-
-def _grow(points: int, device: str) -> tuple[int, float]:
-    """How many vertices, and how long their build takes [s]."""
-    robot = load_robot("kinova", device=device)
-    build(robot, "position", refine=False)  # torch starts up
-    roadmap = build(robot, "position", points=points, refine=False)
-    return len(roadmap.points), roadmap.build_seconds
 
 
 SECTIONS: dict[str, Callable[[_Bench], Iterator[Row]]] = {

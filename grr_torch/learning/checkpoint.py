@@ -14,8 +14,7 @@ from torch import Tensor
 
 from grr_torch.errors import FileFormatError
 from grr_torch.output import atomic_write
-from grr_torch.resolution.roadmap_file import tensors_hash
-from grr_torch.tensor_file import read_tensor_file
+from grr_torch.tensor_file import read_tensor_file, tensors_hash
 
 FORMAT = "grr-torch training"
 FORMAT_VERSION = 1

@@ -19,10 +19,10 @@ from grr_torch.output import atomic_write
 from grr_torch.pieces import one_thread
 from grr_torch.projection.project import Tolerances, point_columns
 from grr_torch.resolution.roadmap import Roadmap
-from grr_torch.resolution.roadmap_file import roadmap_hash, tensors_hash
+from grr_torch.resolution.roadmap_file import roadmap_hash
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace, task_from_json
-from grr_torch.tensor_file import read_tensor_file
+from grr_torch.tensor_file import read_tensor_file, tensors_hash
 from grr_torch.version import __version__
 
 FORMAT = "grr-torch neural IK"

@@ -15,6 +15,7 @@ from grr_torch.output import atomic_write
 from grr_torch.recording import colours
 from grr_torch.recording.robot import RecordedRobot
 from grr_torch.recording.tour import tour
+from grr_torch.resolution.cells import windings
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.slices import fullest_slice
 
@@ -107,12 +108,10 @@ def _log_map(recording: Any, roadmap: Roadmap) -> None:
     log("connected", rr.LineStrips3D(points[edges[connected]], colors=colours.CONNECTED, radii=_line(0.4)))
     log("broken", rr.LineStrips3D(points[edges[broken]], colors=colours.BROKEN, radii=_line(1.6)))
     log("grid", rr.LineStrips3D(points[edges], colors=colours.GRID, radii=_line(0.25)))
-    triangles = roadmap.cells()[0]
-    for name, cells, colour in (
-        ("wound", triangles.wound, colours.WOUND),
-        ("spread", triangles.spread_out, colours.SPREAD),
-    ):
-        corners = triangles.corners[cells].numpy()
+    uncertified = roadmap.uncertified[0]
+    wound = (windings(roadmap, uncertified) != 0).any(1)
+    for name, cells, colour in (("wound", wound, colours.WOUND), ("spread", ~wound, colours.SPREAD)):
+        corners = uncertified[cells].numpy()
         if len(corners):
             log(f"cells/{name}", rr.Mesh3D(vertex_positions=points, triangle_indices=corners, albedo_factor=colour))
     if roadmap.reachable is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
@@ -14,18 +14,23 @@ from grr_torch.errors import ParameterError, UnknownNameError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
 from grr_torch.resolution.auto_seeds import CANDIDATES, find_seeds
+from grr_torch.resolution.checkpoint import Checkpoint, digest
 from grr_torch.resolution.edges import continuous_edges
 from grr_torch.resolution.expand import default_neighbours, expand
+from grr_torch.resolution.memory import require_memory
 from grr_torch.resolution.objectives import check_objectives
 from grr_torch.resolution.problem import Problem, pose_problem
 from grr_torch.resolution.random_grr import random_grr
 from grr_torch.resolution.reachability import measure_reachability
 from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
-from grr_torch.resolution.seeds import SeedsLike
+from grr_torch.resolution.roadmap_file import load_roadmap, robot_to_json
+from grr_torch.resolution.seeds import SeedsLike, check_seeds
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph
 from grr_torch.spaces.task import TaskSpace
+from grr_torch.tensor_file import tensor_hash
+from grr_torch.version import __version__
 
 _MOST_STARTS = 100_000
 
@@ -47,6 +52,8 @@ def build(
     reachability: int = 0,
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
+    checkpoint: str | os.PathLike[str] | None = None,
+    resume: bool = False,
     progress: Progress = silent,
 ) -> Roadmap:
     """Builds a roadmap with Expansion-GRR, or with the baseline Random-GRR, and refines it.
@@ -73,41 +80,105 @@ def build(
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. On the CPU the same inputs give the same tensors.
         tolerances: When a configuration counts as being at a point.
+        checkpoint: A folder, absent or empty, in which it is kept what is done, so that a build that was killed can go
+            on; the finished roadmap stays in it.
+        resume: Whether to go on from what `checkpoint` holds, if it holds anything. The tensors come out as if the
+            build had not been interrupted.
         progress: Told what is being done and how far it is.
 
     Returns:
         The roadmap; its `build_seconds` leave reachability out.
 
     Raises:
-        ParameterError: Something is missing or out of its range, or no point lies within the arm's reach.
+        ParameterError: Something is missing or out of its range, no point lies within the arm's reach, or the build
+            would not fit the memory that is free.
         SeedError: No seed can be used.
+        FileFormatError: The checkpoint is of another build, or corrupt.
+        OutputError: The checkpoint cannot be written, or is there without `resume`.
     """
     problem = pose_problem(robot, task, points, bounds, seeds, rotations)
-    check_seed(seed)
+    options: dict[str, Any] = {
+        "method": method,
+        "candidates": candidates,
+        "neighbours": neighbours,
+        "samples": samples,
+        "refine": refine,
+        "objectives": dict(objectives or {}),
+        "reachability": reachability,
+        "seed": seed,
+        "tolerances": asdict(tolerances),
+    }
+    _check_options(robot, options)
+    if resume and checkpoint is None:
+        raise ParameterError("resume", resume, "with a checkpoint to resume from")
+    what = None if checkpoint is None else describe_build(robot, problem, options)
+    kept = Checkpoint(checkpoint, what, resume)
+    if kept.roadmap is not None:
+        return load_roadmap(kept.roadmap, robot)
+    require_memory(robot, problem, refine)
+    with kept.timed("building"):
+        if method == "random":
+            parts = _at_random(robot, problem, samples, seed, tolerances, progress, kept)
+        else:
+            problem = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
+            parts = _expanded(robot, problem, neighbours, tolerances, progress, kept)
+    settings = {"margin": robot.margin, "seed": seed, "reachability": reachability, "tolerances": asdict(tolerances)}
+    parameters = {"method": method, **parts.chosen, **settings}
+    roadmap = _assemble(robot, problem, parts, parameters, kept.seconds("building"))
+    if refine:
+        roadmap = refine_roadmap(roadmap, objectives=objectives, seed=seed, progress=progress, checkpoint=kept)
+    if reachability:
+        roadmap = _with_reachability(roadmap, tolerances, progress, kept)
+    if kept.folder is not None:
+        roadmap.triangles(progress, kept.stage("triangles"))
+        roadmap.squares(progress, kept.stage("squares"))
+        kept.finish(roadmap.save)
+    return roadmap
+
+
+def _check_options(robot: Robot, options: Mapping[str, Any]) -> None:
+    """Checks what `build` is asked for, whatever the problem.
+
+    Raises:
+        ParameterError: A parameter is out of its range, or does not go with another.
+        UnknownNameError: No such method or objective.
+    """
+    check_seed(options["seed"])
+    objectives, reachability, method = (options[name] for name in ("objectives", "reachability", "method"))
     check_objectives(robot, objectives)
-    if objectives and not refine:
+    if objectives and not options["refine"]:
         raise ParameterError("objectives", tuple(objectives), "none without refinement, which serves them")
     if not 0 <= reachability <= _MOST_STARTS:
         raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
     if method not in ("expansion", "random"):
         raise UnknownNameError("method", method, ("expansion", "random"))
-    begin = time.perf_counter()
-    if method == "random":
-        parts = _at_random(robot, problem, samples, seed, tolerances, progress)
-    else:
-        problem = _with_seeds(robot, problem, candidates, seed, tolerances, progress)
-        parts = _expanded(robot, problem, neighbours, tolerances, progress)
-    seconds = time.perf_counter() - begin
-    settings = {"margin": robot.margin, "seed": seed, "reachability": reachability, "tolerances": asdict(tolerances)}
-    roadmap = _assemble(robot, problem, parts, {"method": method, **parts.chosen, **settings}, seconds)
-    if refine:
-        roadmap = refine_roadmap(roadmap, objectives=objectives, seed=seed, progress=progress)
-    if not reachability:
-        return roadmap
+
+
+def describe_build(robot: Robot, problem: Problem, options: Mapping[str, Any]) -> dict[str, Any]:
+    """All that determines a build, by name, as JSON: what is long, by its SHA-256."""
+    arm = {
+        name: value for name, value in robot_to_json(robot).items() if name not in ("urdf_directory", "package_dirs")
+    }
+    seeds = problem.seeds if isinstance(problem.seeds, str) else tensor_hash(check_seeds(robot, problem.seeds).cpu())
+    graph = {"points": tensor_hash(problem.graph.points), "edges": tensor_hash(problem.graph.edges)}
+    packages = {"grr-torch": __version__, "torch": torch.__version__, "device": robot.device.type}
+    what = {"robot": robot.name, "arm": digest(arm), "task": problem.task.to_json(), **graph, "seeds": seeds}
+    return {**packages, **what, **options}
+
+
+def _with_reachability(roadmap: Roadmap, tolerances: Tolerances, progress: Progress, kept: Checkpoint) -> Roadmap:
     left = ~roadmap.resolved
+    attempts, seed = (roadmap.parameters[name] for name in ("reachability", "seed"))
     reachable = roadmap.resolved.clone()
     reachable[left] = measure_reachability(
-        robot, roadmap.task, roadmap.points[left], reachability, seed=seed, tolerances=tolerances, progress=progress
+        roadmap.robot,
+        roadmap.task,
+        roadmap.points[left],
+        attempts,
+        seed=seed,
+        tolerances=tolerances,
+        progress=progress,
+        kept=kept.stage("reachability"),
     )
     return replace(roadmap, reachable=reachable)
 
@@ -129,33 +200,67 @@ class _Parts(NamedTuple):
 
 
 def _at_random(
-    robot: Robot, problem: Problem, samples: int, seed: int, tolerances: Tolerances, progress: Progress
+    robot: Robot,
+    problem: Problem,
+    samples: int,
+    seed: int,
+    tolerances: Tolerances,
+    progress: Progress,
+    kept: Checkpoint,
 ) -> _Parts:
-    found = random_grr(
-        robot, problem.task, problem.graph, samples=samples, seed=seed, tolerances=tolerances, progress=progress
-    )
-    return _Parts(found.configurations, found.wave, found.connected, {"samples": samples, "seeds": []})
+    def resolve() -> dict[str, Tensor]:
+        found = random_grr(
+            robot, problem.task, problem.graph, samples=samples, seed=seed, tolerances=tolerances, progress=progress
+        )
+        return {"configurations": found.configurations, "wave": found.wave, "connected": found.connected}
+
+    return _Parts(**kept.once("random", resolve), chosen={"samples": samples, "seeds": []})
 
 
 def _with_seeds(
-    robot: Robot, problem: Problem, candidates: int, seed: int, tolerances: Tolerances, progress: Progress
+    robot: Robot,
+    problem: Problem,
+    candidates: int,
+    seed: int,
+    tolerances: Tolerances,
+    progress: Progress,
+    kept: Checkpoint,
 ) -> Problem:
     """The problem with seeds that are found, where none are given."""
     task, graph, seeds = problem
     if not isinstance(seeds, str):
         return problem
-    found = find_seeds(robot, task, graph, candidates=candidates, seed=seed, tolerances=tolerances, progress=progress)
-    return Problem(task, graph, found)
+
+    def find() -> dict[str, Tensor]:
+        options = {"candidates": candidates, "seed": seed}
+        return {"seeds": find_seeds(robot, task, graph, **options, tolerances=tolerances, progress=progress)}
+
+    return Problem(task, graph, kept.once("seeds", find)["seeds"].to(robot.device))
 
 
 def _expanded(
-    robot: Robot, problem: Problem, neighbours: int | None, tolerances: Tolerances, progress: Progress
+    robot: Robot,
+    problem: Problem,
+    neighbours: int | None,
+    tolerances: Tolerances,
+    progress: Progress,
+    kept: Checkpoint,
 ) -> _Parts:
     task, graph, table = problem
     assert not isinstance(table, str)
-    expansion = expand(robot, task, graph, table, neighbours=neighbours, tolerances=tolerances, progress=progress)
+    expansion = expand(
+        robot,
+        task,
+        graph,
+        table,
+        neighbours=neighbours,
+        tolerances=tolerances,
+        progress=progress,
+        kept=kept.stage("expansion"),
+    )
     found = expansion.configurations, expansion.resolved
-    connected = continuous_edges(robot, task, graph.points, *found, graph.edges, tolerances, progress)
+    stage = kept.stage("edges")
+    connected = continuous_edges(robot, task, graph.points, *found, graph.edges, tolerances, progress, stage)
     chosen = {
         "neighbours": default_neighbours(task) if neighbours is None else neighbours,
         "seeds": torch.as_tensor(table, dtype=torch.float64).tolist(),

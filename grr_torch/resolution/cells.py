@@ -20,6 +20,7 @@ from torch import Tensor
 
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.spaces.cliques import draw
 from grr_torch.spaces.configuration import difference, distance
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 LARGEST_SPREAD = 1.0
 # projections on the way from a corner to the centre
 _STEPS = 8
-_CELLS_AT_ONCE = 8192
+CELLS_AT_ONCE = 8192
 # cells of a space in which rotation varies that are measured: those of a product are too many
 _MOST_MEASURED = 20_000
 
@@ -68,19 +69,70 @@ class Cells:
         return ~self.wound & ~self.spread_out
 
 
-def measure_cells(roadmap: Roadmap, corners: Tensor, progress: Progress = silent) -> Cells:
+def measure_cells(roadmap: Roadmap, corners: Tensor, progress: Progress = silent, kept: Stage = UNKEPT) -> Cells:
     """Winding and spread of cells given by their corners (C, k); where rotation varies, of at most 20,000 of them."""
-    robot = roadmap.robot
     if roadmap.task.rotations is not None:
         corners = corners[draw(len(corners), _MOST_MEASURED)]
-    wraps = robot.continuous.cpu()
-    q = roadmap.configurations[corners]
-    turns = difference(q, q.roll(-1, dims=1), wraps).sum(1) / (2.0 * math.pi)
-    return Cells(corners, torch.where(wraps, turns.round(), 0.0).to(torch.int64), _spread(roadmap, corners, progress))
+    robot, tolerances = roadmap.robot, Tolerances(**roadmap.parameters["tolerances"])
+    points, q = (part.to(robot.lower) for part in (roadmap.points, roadmap.configurations))
+    spread = spreads(robot, roadmap.task, points, q, corners, tolerances, progress, kept)
+    return Cells(corners, windings(roadmap, corners), spread.cpu())
+
+
+def windings(roadmap: Roadmap, corners: Tensor) -> Tensor:
+    """(C, n) turns that each joint makes once round cells (C, k); only continuous joints can make any."""
+    wraps = roadmap.robot.continuous.cpu()
+    turns = torch.empty(len(corners), roadmap.robot.n, dtype=torch.int8)
+    for start in range(0, len(corners), CELLS_AT_ONCE):
+        part = slice(start, start + CELLS_AT_ONCE)
+        q = roadmap.configurations[corners[part]]
+        angles = difference(q, q.roll(-1, dims=1), wraps).sum(1)
+        turns[part] = torch.where(wraps, (angles / (2.0 * math.pi)).round(), 0.0).to(torch.int8)
+    return turns
+
+
+def spreads(
+    robot: Robot,
+    task: TaskSpace,
+    points: Tensor,
+    q: Tensor,
+    corners: Tensor,
+    tolerances: Tolerances,
+    progress: Progress = silent,
+    kept: Stage = UNKEPT,
+) -> Tensor:
+    """The spread (C,) of cells, as in `Cells`.
+
+    Args:
+        robot: The robot.
+        task: The task space.
+        points: (V, width) points.
+        q: (V, n) configurations there.
+        corners: (C, k) cells.
+        tolerances: Of the projections.
+        progress: Told how many cells are done.
+        kept: Where it is kept how far that is.
+    """
+    count = len(corners)
+    spread = q.new_empty(count)
+    state = kept.state()
+    done = int(state["done"]) if state else 0
+    spread[:done] = state["spread"].to(spread) if state else spread[:0]
+    pairs = torch.combinations(torch.arange(corners.shape[1], device=q.device))
+    for start in range(done, count, CELLS_AT_ONCE):
+        progress("measuring cells", start, count)
+        part = corners[start : start + CELLS_AT_ONCE].to(q.device)
+        ends, followed = lead_to_centres(robot, task, points[part], q[part], tolerances)
+        apart = distance(ends[:, pairs[:, 0]], ends[:, pairs[:, 1]], robot.continuous).amax(1)
+        end = start + len(part)
+        spread[start:end] = torch.where(followed, apart, torch.inf)
+        kept.keep({"spread": spread[:end], "done": torch.tensor(end)}, last=end == count)
+    progress("measuring cells", count, count)
+    return spread
 
 
 def lead_to_centres(
-    robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress = silent
+    robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances
 ) -> tuple[Tensor, Tensor]:
     """Follows the straight lines from the corners of cells to their centres.
 
@@ -90,22 +142,10 @@ def lead_to_centres(
         points: (C, k, width) corners.
         q: (C, k, n) configurations there.
         tolerances: Of the projections.
-        progress: Told how many cells are done.
 
     Returns:
         Configurations (C, k, n) at the centres, and where all corners of a cell led to one (C,).
     """
-    count = len(points)
-    ends, followed = torch.empty_like(q), torch.empty(count, dtype=torch.bool, device=q.device)
-    for start in range(0, count, _CELLS_AT_ONCE):
-        progress("measuring cells", start, count)
-        part = slice(start, start + _CELLS_AT_ONCE)
-        ends[part], followed[part] = _lead(robot, task, points[part], q[part], tolerances)
-    progress("measuring cells", count, count)
-    return ends, followed
-
-
-def _lead(robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: Tolerances) -> tuple[Tensor, Tensor]:
     count, sides, _ = points.shape
     centre = task.centre(points)[:, None].expand_as(points)
     columns = q.reshape(-1, robot.n).T.contiguous()
@@ -116,12 +156,3 @@ def _lead(robot: Robot, task: TaskSpace, points: Tensor, q: Tensor, tolerances: 
         followed &= valid
         columns = torch.where(valid, solved, columns)
     return columns.T.reshape(count, sides, robot.n), followed.reshape(count, sides).all(1)
-
-
-def _spread(roadmap: Roadmap, corners: Tensor, progress: Progress) -> Tensor:
-    robot, tolerances = roadmap.robot, Tolerances(**roadmap.parameters["tolerances"])
-    points, q = (part[corners].to(robot.lower) for part in (roadmap.points, roadmap.configurations))
-    ends, followed = lead_to_centres(robot, roadmap.task, points, q, tolerances, progress)
-    pairs = torch.combinations(torch.arange(corners.shape[1], device=q.device))
-    apart = distance(ends[:, pairs[:, 0]], ends[:, pairs[:, 1]], robot.continuous).amax(1)
-    return torch.where(followed, apart, torch.inf).cpu()

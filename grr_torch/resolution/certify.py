@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from grr_torch.pieces import one_thread
-from grr_torch.progress import Progress, silent
+from grr_torch.progress import Progress
 from grr_torch.projection.project import Tolerances
-from grr_torch.resolution.cells import LARGEST_SPREAD, lead_to_centres
+from grr_torch.resolution.cells import CELLS_AT_ONCE, LARGEST_SPREAD, lead_to_centres, spreads
+from grr_torch.resolution.checkpoint import Checkpoint, Stage
 from grr_torch.resolution.relax import Network, Pulls, gauss_newton_step, move
 from grr_torch.spaces.configuration import difference
 
@@ -29,7 +30,14 @@ _DAMPING = 0.3
 _SACRIFICES = (6, 10, 14)
 
 
-def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress) -> Tensor:
+def certify(
+    network: Network,
+    corners: Tensor,
+    q: Tensor,
+    tolerances: Tolerances,
+    progress: Progress,
+    checkpoint: Checkpoint | None = None,
+) -> Tensor:
     """Configurations (n, V) with fewer cells whose spread is above 1 rad, and the rest as smooth as may be.
 
     Args:
@@ -38,40 +46,62 @@ def certify(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances
         q: (n, V) configurations.
         tolerances: Of the projections.
         progress: Told what round it is.
+        checkpoint: Where it is kept how far that is.
     """
+    checkpoint = checkpoint or Checkpoint()
+    looking, kept, looking_again = map(checkpoint.stage, ("spread", "certification", "spread-again"))
+    robot, task, points = network.robot, network.task, network.targets.T
+
+    def count_uncertified(q: Tensor, stage: Stage) -> tuple[int, Tensor]:
+        spread = spreads(robot, task, points, q.T, corners, tolerances, progress, stage)
+        return int((spread > LARGEST_SPREAD).sum()), corners[spread > _SUSPECT]
+
     with one_thread(), torch.no_grad():
-        everything, start = corners, q
-        spread = _spread(network, corners, q, tolerances, progress)[0]
-        uncertified_before = int((spread > LARGEST_SPREAD).sum())
-        corners = corners[spread > _SUSPECT]
+        uncertified_before, suspects = count_uncertified(q, looking)
         if uncertified_before == 0:
             return q
-        weight = _WEIGHT * float((1.0 / network.lengths).mean())
-        best, fewest = q, torch.inf
-        given_up = torch.zeros(len(corners), dtype=torch.bool, device=q.device)
-        for done in range(_ROUNDS):
-            progress("certifying", done, _ROUNDS)
-            spread, pairs, apart = _spread(network, corners, q, tolerances)
-            uncertified = int((spread > LARGEST_SPREAD).sum())
-            if uncertified < fewest:
-                best, fewest = q, uncertified
-            excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
-            if done in _SACRIFICES:
-                given_up |= _worst_of_neighbours(network, corners, spread)
-            pulled = ((excess > 0.0) & ((spread <= _HOPELESS) & ~given_up).repeat(3)).nonzero()[:, 0]
-            if len(pulled) == 0:
-                break
-            # only what is beyond the aim is drawn in
-            share = excess[pulled] / (excess[pulled] + _AIM)
-            pulls = Pulls(pairs[:, pulled], apart[:, pulled] * share, torch.full_like(share, weight * (1 + done)))
-            q = move(network, q, gauss_newton_step(network, q, _DAMPING, pulls), tolerances)
-        spread = _spread(network, corners, q, tolerances)[0]
-        if int((spread > LARGEST_SPREAD).sum()) < fewest:
-            best = q
+        moved = _drawn_together(network, suspects, q, tolerances, progress, kept)
         # cells that were not looked at may have suffered
-        after = int((_spread(network, everything, best, tolerances, progress)[0] > LARGEST_SPREAD).sum())
+        after, _ = count_uncertified(moved, looking_again)
     progress("certifying", _ROUNDS, _ROUNDS)
-    return best if after < uncertified_before else start
+    return moved if after < uncertified_before else q
+
+
+def _drawn_together(
+    network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress, kept: Stage
+) -> Tensor:
+    """Configurations (n, V) of the round after which the fewest of some cells were uncertified."""
+    best, fewest, begin = q, torch.inf, 0
+    given_up = torch.zeros(len(corners), dtype=torch.bool, device=q.device)
+    if state := kept.state():
+        q, best, given_up = (state[name].to(q.device) for name in ("q", "best", "given_up"))
+        fewest, begin = float(state["fewest"]), int(state["done"])
+    weight = _WEIGHT * float((1.0 / network.lengths).mean())
+    for done in range(begin, _ROUNDS):
+        progress("certifying", done, _ROUNDS)
+        spread, pairs, apart = _spread(network, corners, q, tolerances)
+        uncertified = int((spread > LARGEST_SPREAD).sum())
+        if uncertified < fewest:
+            best, fewest = q, uncertified
+        excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
+        if done in _SACRIFICES:
+            given_up |= _worst_of_neighbours(network, corners, spread)
+        pulled = ((excess > 0.0) & ((spread <= _HOPELESS) & ~given_up).repeat(3)).nonzero()[:, 0]
+        if len(pulled) == 0:
+            break
+        # only what is beyond the aim is drawn in
+        share = excess[pulled] / (excess[pulled] + _AIM)
+        pulls = Pulls(pairs[:, pulled], apart[:, pulled] * share, torch.full_like(share, weight * (1 + done)))
+        q = move(network, q, gauss_newton_step(network, q, _DAMPING, pulls), tolerances)
+        kept.keep(_state(q, best, given_up, fewest, done + 1))
+    kept.keep(_state(q, best, given_up, fewest, _ROUNDS), last=True)
+    spread = _spread(network, corners, q, tolerances)[0]
+    return q if int((spread > LARGEST_SPREAD).sum()) < fewest else best
+
+
+def _state(q: Tensor, best: Tensor, given_up: Tensor, fewest: float, done: int) -> dict[str, Tensor]:
+    numbers = {"fewest": torch.tensor(fewest, dtype=torch.float64), "done": torch.tensor(done)}
+    return {"q": q, "best": best, "given_up": given_up, **numbers}
 
 
 def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> Tensor:
@@ -83,15 +113,16 @@ def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> T
     return open_cells & (spread >= worst[corners].amax(1))
 
 
-def _spread(
-    network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress = silent
-) -> tuple[Tensor, Tensor, Tensor]:
+def _spread(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances) -> tuple[Tensor, Tensor, Tensor]:
     """Spread of cells (C,), and of their three pairs of corners: (2, 3C) and what is between their ends (n, 3C)."""
     robot = network.robot
-    points = network.targets.T[corners]
-    ends, followed = lead_to_centres(robot, network.task, points, q.T[corners], tolerances, progress)
-    turned = ends.roll(-1, dims=1)
-    apart = difference(ends, turned, robot.continuous).transpose(0, 1).reshape(-1, robot.n).T
+    parts = [part.to(q.device) for part in corners.split(CELLS_AT_ONCE)]
+    ends, followed = zip(
+        *(lead_to_centres(robot, network.task, network.targets.T[part], q.T[part], tolerances) for part in parts),
+        strict=True,
+    )
+    at_centre = torch.cat(ends)
+    apart = difference(at_centre, at_centre.roll(-1, dims=1), robot.continuous).transpose(0, 1).reshape(-1, robot.n).T
     pairs = torch.stack([corners.T.flatten(), corners.roll(-1, dims=1).T.flatten()])
     spread = apart.square().sum(0).sqrt().reshape(3, -1).amax(0)
-    return torch.where(followed, spread, torch.inf), pairs, apart
+    return torch.where(torch.cat(followed), spread, torch.inf), pairs, apart

@@ -10,6 +10,7 @@ from torch import Tensor
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace
 
@@ -20,10 +21,10 @@ if TYPE_CHECKING:
 _AT_ONCE = 16384
 
 
-def check_edges(roadmap: Roadmap, tolerances: Tolerances, progress: Progress = silent) -> Tensor:
+def check_edges(roadmap: Roadmap, tolerances: Tolerances, progress: Progress = silent, kept: Stage = UNKEPT) -> Tensor:
     """Which edges of a roadmap are continuous, checked anew: (E,) bool."""
     parts = (roadmap.points, roadmap.configurations, roadmap.resolved, roadmap.edges)
-    return continuous_edges(roadmap.robot, roadmap.task, *parts, tolerances, progress).cpu()
+    return continuous_edges(roadmap.robot, roadmap.task, *parts, tolerances, progress, kept).cpu()
 
 
 def continuous_edges(
@@ -35,6 +36,7 @@ def continuous_edges(
     edges: Tensor,
     tolerances: Tolerances,
     progress: Progress,
+    kept: Stage = UNKEPT,
 ) -> Tensor:
     """Which edges between resolved vertices are continuous: (E,) bool, on the robot's device.
 
@@ -47,17 +49,23 @@ def continuous_edges(
         edges: (E, 2) vertices of each edge.
         tolerances: Of the projections.
         progress: Told how many edges are checked.
+        kept: Where it is kept how far that is.
     """
     configurations, resolved, edges = (part.to(robot.device) for part in (configurations, resolved, edges))
     configurations = configurations.to(robot.dtype)
     points = points.to(configurations)
     connected = torch.zeros(len(edges), dtype=torch.bool, device=robot.device)
     candidates = resolved[edges].all(1).nonzero()[:, 0]
-    for start in range(0, len(candidates), _AT_ONCE):
+    state = kept.state()
+    if state:
+        connected = state["connected"].to(robot.device)
+    for start in range(int(state["done"]) if state else 0, len(candidates), _AT_ONCE):
         progress("checking edges", start, len(candidates))
         part = candidates[start : start + _AT_ONCE]
         a, b = edges[part].T
         ends = points[a], points[b], configurations[a], configurations[b]
         connected[part] = is_continuous(robot, task, *ends, tolerances=tolerances)
+        end = start + len(part)
+        kept.keep({"connected": connected, "done": torch.tensor(end)}, last=end == len(candidates))
     progress("checking edges", len(candidates), len(candidates))
     return connected

@@ -12,6 +12,7 @@ from torch.nn.functional import embedding_bag
 from grr_torch.errors import ParameterError
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, project_columns
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.reachability import within_reach
 from grr_torch.resolution.seeds import SeedsLike, check_seeds, place_seeds
 from grr_torch.robots.robot import Robot
@@ -51,6 +52,7 @@ def expand(
     neighbours: int | None = None,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
     progress: Progress = silent,
+    kept: Stage = UNKEPT,
 ) -> Expansion:
     """Expands seeds over a task graph.
 
@@ -69,6 +71,7 @@ def expand(
             default 2.
         tolerances: Of the projections.
         progress: Told how many vertices are resolved.
+        kept: Where it is kept how far that is.
 
     Raises:
         SeedError: No seed can be used.
@@ -81,7 +84,17 @@ def expand(
     if task.rotations is not None and neighbours > MOST_HOPS:
         raise ParameterError("neighbours", neighbours, f"1 to {MOST_HOPS} edges, as rotation varies")
     vertices, placed = place_seeds(robot, task, graph, check_seeds(robot, seeds), tolerances)
-    return grow(robot, task, graph, vertices, placed, neighbours=neighbours, tolerances=tolerances, progress=progress)
+    return grow(
+        robot,
+        task,
+        graph,
+        vertices,
+        placed,
+        neighbours=neighbours,
+        tolerances=tolerances,
+        progress=progress,
+        kept=kept,
+    )
 
 
 def grow(
@@ -94,6 +107,7 @@ def grow(
     neighbours: int,
     tolerances: Tolerances,
     progress: Progress = silent,
+    kept: Stage = UNKEPT,
 ) -> Expansion:
     """`expand` from vertices `found` (K,) that have configurations `placed` (K, n)."""
     count = len(graph.points)
@@ -103,21 +117,32 @@ def grow(
     embedded = configurations.new_zeros(count, 2 * robot.n)
     targets = graph.points.to(device=robot.device, dtype=robot.dtype).T.contiguous()
     candidates = within_reach(robot, task, graph.points).to(robot.device)
+    within = int(candidates.sum())
     waiting = torch.zeros_like(candidates)
-    for current in itertools.count():
+    begin = 0
+    if state := kept.state():
+        configurations, wave, waiting = (state[name].to(robot.device) for name in ("configurations", "wave", "waiting"))
+        resolved = wave >= 0
+        embedded[resolved] = embed(configurations[resolved], robot.continuous)
+        candidates &= ~resolved
+        found, placed, begin = state["found"].to(robot.device), state["placed"].to(robot.device), int(state["next"])
+    for current in itertools.count(begin):
         configurations[found], wave[found], candidates[found] = placed, current, False
         embedded[found] = embed(placed, robot.continuous)
         waiting[graph.around(found)[1]] = True
         frontier = (waiting & candidates).nonzero()[:, 0]
-        progress("expanding", int((wave >= 0).sum()), count)
+        progress("expanding", int((wave >= 0).sum()), within)
         guesses, known = _average(graph, embedded, frontier, neighbours, robot.continuous)
         # an edge may lead to a vertex that is not among the nearest; its end waits until one of these is resolved
         frontier = frontier[known]
-        if len(frontier) == 0:
-            return Expansion(configurations, wave)
         waiting[frontier] = False
         solved, valid = project_columns(robot, task, targets[:, frontier], guesses[known].T.contiguous(), tolerances)
         found, placed = frontier[valid], solved.T[valid]
+        state = {"configurations": configurations, "wave": wave, "waiting": waiting, "found": found, "placed": placed}
+        kept.keep({**state, "next": torch.tensor(current + 1)}, last=len(frontier) == 0)
+        if len(frontier) == 0:
+            progress("expanding", within, within)
+            return Expansion(configurations, wave)
     raise AssertionError("unreachable")
 
 

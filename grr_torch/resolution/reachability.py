@@ -8,6 +8,7 @@ from torch import Tensor
 from grr_torch.errors import ParameterError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, project_columns
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace
 
@@ -24,6 +25,7 @@ def measure_reachability(
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
     progress: Progress = silent,
+    kept: Stage = UNKEPT,
 ) -> Tensor:
     """Which points some random-start projection reaches free of self-collision: (V,) bool, on the CPU.
 
@@ -35,6 +37,7 @@ def measure_reachability(
         seed: Of the random starts.
         tolerances: Of the projections.
         progress: Told how many starts were tried for each point.
+        kept: Where it is kept how far that is.
 
     Raises:
         ParameterError: `attempts` is below 1.
@@ -43,12 +46,19 @@ def measure_reachability(
         raise ParameterError("reachability", attempts, "1 or more random starts a vertex")
     generator = torch.Generator().manual_seed(check_seed(seed))
     reached = torch.zeros(len(points), dtype=torch.bool)
-    left = within_reach(robot, task, points).nonzero()[:, 0]
-    for done in range(0, attempts, _ROUND):
+    begin = 0
+    if state := kept.state():
+        reached, begin = state["reached"], int(state["done"])
+        generator.set_state(state["generator"])
+    left = (within_reach(robot, task, points) & ~reached).nonzero()[:, 0]
+    for done in range(begin, attempts, _ROUND):
         progress("measuring reachability", done, attempts)
         starts = min(_ROUND, attempts - done)
         reached[left] = from_random_starts(robot, task, points[left], starts, generator, tolerances)[1].any(1)
         left = left[~reached[left]]
+        end = done + starts
+        state = {"reached": reached, "generator": generator.get_state(), "done": torch.tensor(end)}
+        kept.keep(state, last=end == attempts)
     progress("measuring reachability", attempts, attempts)
     return reached
 

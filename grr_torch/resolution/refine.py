@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,12 +11,13 @@ from torch import Tensor
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.certify import certify
+from grr_torch.resolution.checkpoint import UNKEPT, Checkpoint, Stage
 from grr_torch.resolution.edges import continuous_edges
 from grr_torch.resolution.objectives import Objective, check_objectives, measure_objective
 from grr_torch.resolution.quality import edge_slopes
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.resolution.repair import repair
-from grr_torch.resolution.report import BEFORE
+from grr_torch.resolution.report import before_refinement
 from grr_torch.resolution.roadmap import Roadmap
 
 # of an objective's scale: no arm is at a singularity or a limit everywhere
@@ -26,7 +25,12 @@ _LEAST_SCALE = 1e-9
 
 
 def refine(
-    roadmap: Roadmap, *, objectives: Mapping[str, float] | None = None, seed: int = 0, progress: Progress = silent
+    roadmap: Roadmap,
+    *,
+    objectives: Mapping[str, float] | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    checkpoint: Checkpoint | None = None,
 ) -> Roadmap:
     """Improves a roadmap: more vertices, more edges, and a smaller mean of D_q / D_p.
 
@@ -40,6 +44,7 @@ def refine(
         objectives: Weights of "clearance", "manipulability" and "limits"; one with weight 0 is only reported.
         seed: Of the random starts.
         progress: Told what is being done and how far it is.
+        checkpoint: Where it is kept what is done; nowhere by default.
 
     Returns:
         The refined roadmap; its `build_seconds` include the refinement, and `parameters["refinement"]` tells what it
@@ -50,14 +55,15 @@ def refine(
         ParameterError: A weight is not valid, or the robot has no such objective.
     """
     weights = check_objectives(roadmap.robot, objectives)
-    before = roadmap.quality(progress)
-    begin = time.perf_counter()
+    checkpoint = checkpoint or Checkpoint()
+    told = before_refinement(roadmap, progress, checkpoint.stage("triangles"))
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
-    smoothest = _relaxed(repair(roadmap, tolerances, seed, progress), {}, tolerances, progress)
-    wanted = {name: weight for name, weight in weights.items() if weight > 0.0}
-    refined = _relaxed(smoothest, wanted, tolerances, progress) if wanted else smoothest
-    seconds = time.perf_counter() - begin
-    told: dict[str, Any] = {**{name: getattr(before, name) for name in BEFORE}, "seconds": seconds}
+    with checkpoint.timed("refinement"):
+        repaired = repair(roadmap, tolerances, seed, progress, checkpoint.stage("repair"))
+        smoothest = _relaxed(repaired, {}, tolerances, progress, checkpoint)
+        wanted = {name: weight for name, weight in weights.items() if weight > 0.0}
+        refined = _relaxed(smoothest, wanted, tolerances, progress, checkpoint) if wanted else smoothest
+    seconds = told["seconds"] = checkpoint.seconds("refinement")
     if weights:
         slopes = edge_slopes(smoothest)
         told["smoothest"] = float(slopes.mean()) if len(slopes) else None
@@ -81,7 +87,9 @@ def _figures(roadmap: Roadmap, objective: str) -> dict[str, float | None]:
     return {"mean": float(values.mean()), "worst": float(values.min())}
 
 
-def _relaxed(roadmap: Roadmap, weights: Mapping[str, float], tolerances: Tolerances, progress: Progress) -> Roadmap:
+def _relaxed(
+    roadmap: Roadmap, weights: Mapping[str, float], tolerances: Tolerances, progress: Progress, checkpoint: Checkpoint
+) -> Roadmap:
     """The relaxed and certified map, but for the surroundings of edges that it would break."""
     edges = roadmap.edges[roadmap.connected]
     if len(edges) == 0:
@@ -90,12 +98,12 @@ def _relaxed(roadmap: Roadmap, weights: Mapping[str, float], tolerances: Toleran
     rank = torch.full((len(roadmap.points),), -1).index_put_((vertices,), torch.arange(len(vertices)))
     network = _network(roadmap, vertices, rank[edges], weights)
     old = roadmap.configurations[vertices].to(roadmap.robot.lower)
-    new = relax(network, old.T.contiguous(), tolerances, progress)
-    cells = rank[roadmap.graph.triangles(roadmap.connected)].to(roadmap.robot.device)
-    new = certify(network, cells, new, tolerances, progress).T
+    new = relax(network, old.T.contiguous(), tolerances, progress, kept=checkpoint.stage("relaxation"))
+    cells = rank[roadmap.graph.triangles(roadmap.connected)]
+    new = certify(network, cells, new, tolerances, progress, checkpoint).T
     configurations = roadmap.configurations.clone()
     configurations[vertices] = new.cpu()
-    return _without_losses(roadmap, configurations, tolerances, progress)
+    return _without_losses(roadmap, configurations, tolerances, progress, checkpoint.stage("edges-again"))
 
 
 def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping[str, float]) -> Network:
@@ -112,7 +120,9 @@ def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping
     return Network(robot, task, points.T.contiguous(), edges.T.contiguous().to(robot.device), lengths, objectives)
 
 
-def _without_losses(roadmap: Roadmap, configurations: Tensor, tolerances: Tolerances, progress: Progress) -> Roadmap:
+def _without_losses(
+    roadmap: Roadmap, configurations: Tensor, tolerances: Tolerances, progress: Progress, kept: Stage
+) -> Roadmap:
     """The roadmap with new configurations, but with its own round edges that would be lost."""
     connected = torch.zeros_like(roadmap.connected)
     stale = torch.ones_like(roadmap.connected)
@@ -121,8 +131,9 @@ def _without_losses(roadmap: Roadmap, configurations: Tensor, tolerances: Tolera
     while True:
         edges = roadmap.edges[stale]
         connected[stale] = continuous_edges(
-            robot, task, points, configurations, resolved, edges, tolerances, progress
+            robot, task, points, configurations, resolved, edges, tolerances, progress, kept
         ).cpu()
+        kept = UNKEPT  # the first time takes nearly all of it
         lost = roadmap.edges[roadmap.connected & ~connected].unique()
         if len(lost) == 0:
             return replace(roadmap, configurations=configurations, connected=connected)

@@ -16,10 +16,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from grr_torch.pieces import one_thread
+from grr_torch.pieces import in_pieces, one_thread
 from grr_torch.progress import Progress
 from grr_torch.projection.columns import null_space_projector, transposed_product
 from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.objectives import Objective
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import difference, normalise
@@ -103,15 +104,20 @@ class Network:
 
     def motions(self, q: Tensor) -> Tensor:
         """(n, E) wrapped differences along the edges."""
-        first, second = self.edges
-        return difference(q[:, first], q[:, second], self.robot.continuous[:, None])
+        return in_pieces(lambda ends: (self._between(q, ends),), self.edges)[0]
 
     def costs(self, q: Tensor) -> Tensor:
         """(P,) sums of D_q / D_p, rounded off at zero, by part, and of the objectives' costs, for (n, V)."""
-        slopes = (self.motions(q).square().sum(0) + _SHORTEST**2).sqrt() / self.lengths
+        (moved,) = in_pieces(lambda ends: (self._between(q, ends).square().sum(0),), self.edges)
+        slopes = moved.add_(_SHORTEST**2).sqrt_() / self.lengths
         if self.parts is not None:
             return self.parts[self.edges[0]].bincount(slopes, minlength=int(self.parts.max()) + 1)
         return slopes.sum()[None] + sum(objective.cost(q) for objective in self.objectives)
+
+    def _between(self, q: Tensor, ends: Tensor) -> Tensor:
+        """(n, M) wrapped differences between the columns that `ends` (2, M) are."""
+        first, second = ends
+        return difference(q[:, first], q[:, second], self.robot.continuous[:, None])
 
 
 class Pulls(NamedTuple):
@@ -128,14 +134,25 @@ class Pulls(NamedTuple):
     weights: Tensor
 
 
-def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progress, rounds: int = _ROUNDS) -> Tensor:
+def relax(
+    network: Network,
+    q: Tensor,
+    tolerances: Tolerances,
+    progress: Progress,
+    rounds: int = _ROUNDS,
+    kept: Stage = UNKEPT,
+) -> Tensor:
     """Configurations (n, V) of lower cost: converged, within limits and free of self-collision like those given."""
     parts = network.parts if network.parts is not None else torch.zeros_like(network.targets[0], dtype=torch.long)
     costs = network.costs(q)
     damping = torch.full_like(costs, 1e-2)
     going_on = torch.ones_like(costs, dtype=torch.bool)
+    begin = 0
+    if state := kept.state():
+        q, costs, damping, going_on = (state[name].to(q.device) for name in ("q", "costs", "damping", "going_on"))
+        begin = int(state["done"]) if bool(going_on.any()) else rounds
     with one_thread(), torch.no_grad():
-        for done in range(rounds):
+        for done in range(begin, rounds):
             progress("refining", done, rounds)
             moved = move(network, q, gauss_newton_step(network, q, damping[parts]), tolerances)
             new_costs = network.costs(moved)
@@ -143,7 +160,10 @@ def relax(network: Network, q: Tensor, tolerances: Tolerances, progress: Progres
             going_on = torch.where(better, new_costs < (1.0 - _LEAST_GAIN) * costs, going_on & (damping <= 1e2))
             q, costs = torch.where(better[parts], moved, q), torch.where(better, new_costs, costs)
             damping = torch.where(better, (0.3 * damping).clamp_min(1e-4), 10.0 * damping)
-            if not bool(going_on.any()):
+            last = done + 1 == rounds or not bool(going_on.any())
+            state = {"q": q, "costs": costs, "damping": damping, "going_on": going_on, "done": torch.tensor(done + 1)}
+            kept.keep(state, last=last)
+            if last:
                 break
     progress("refining", rounds, rounds)
     return q
@@ -156,16 +176,22 @@ def gauss_newton_step(network: Network, q: Tensor, damping: float | Tensor, pull
     """
     robot = network.robot
     motions = network.motions(q)
-    weights = 1.0 / ((motions.square().sum(0) + _SHORTEST**2).sqrt() * network.lengths)
-    jacobian = network.task.jacobian(robot.tree.jacobian(robot.tree.frames(q)), network.targets)
-    # small, but large enough for the pivots of a straight arm
-    projector = null_space_projector(jacobian, torch.finfo(q.dtype).eps ** 0.6)
+    (moved,) = in_pieces(lambda part: (part.square().sum(0),), motions)
+    weights = 1.0 / (moved.add_(_SHORTEST**2).sqrt_() * network.lengths)
+
+    def null_space(part: Tensor, targets: Tensor) -> tuple[Tensor]:
+        jacobian = network.task.jacobian(robot.tree.jacobian(robot.tree.frames(part)), targets)
+        # small, but large enough for the pivots of a straight arm
+        return (null_space_projector(jacobian, torch.finfo(q.dtype).eps ** 0.6),)
+
+    (projector,) = in_pieces(null_space, q, network.targets)
     incidence = network.incidence
     if pulls is not None:
         incidence = _Incidence.of(torch.cat([network.edges, pulls.pairs], dim=1), q)
         motions, weights = torch.cat([motions, pulls.motions], dim=1), torch.cat([weights, pulls.weights])
     held = incidence.neighbours(torch.ones_like(q[:1]), weights)[0]
-    forces = incidence.gather(weights * motions)
+    forces = incidence.gather(motions.mul_(weights))
+    del motions
     models = [objective.model(q) for objective in network.objectives]
     directions = [direction for _, curved in models for direction in curved]
     stiffness = held + sum(direction.square().sum(0) for direction in directions)

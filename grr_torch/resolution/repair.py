@@ -11,6 +11,7 @@ from torch import Tensor
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.quality import STEEP, edge_slopes
 from grr_torch.resolution.reachability import within_reach
 from grr_torch.resolution.roadmap import Roadmap
@@ -22,6 +23,8 @@ _STARTS = 8
 _ROUNDS = 5
 # candidates of a vertex whose edges are checked
 _CHECKED = 3
+# what a repair changes
+_CHANGING = ("configurations", "connected", "wave")
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,9 @@ class _Trial(NamedTuple):
     joined: Tensor
 
 
-def repair(roadmap: Roadmap, tolerances: Tolerances, seed: int, progress: Progress = silent) -> Roadmap:
+def repair(
+    roadmap: Roadmap, tolerances: Tolerances, seed: int, progress: Progress = silent, kept: Stage = UNKEPT
+) -> Roadmap:
     """Resolves more vertices and connects more edges; what was connected stays so.
 
     Args:
@@ -78,11 +83,17 @@ def repair(roadmap: Roadmap, tolerances: Tolerances, seed: int, progress: Progre
         tolerances: Of the projections.
         seed: Of the random starts.
         progress: Told what round it is.
+        kept: Where it is kept how far that is.
     """
     slopes = edge_slopes(roadmap)
     max_slope = STEEP * float(slopes.median()) if len(slopes) else torch.inf
     means = _Means(roadmap.graph, tolerances, max_slope, torch.Generator().manual_seed(seed))
-    for turn in range(_ROUNDS):
+    begin = 0
+    if state := kept.state():
+        means.generator.set_state(state["generator"])
+        begin = int(state["turn"])
+        roadmap = _changed(roadmap, *(state[name] for name in _CHANGING))
+    for turn in range(begin, _ROUNDS):
         progress("repairing", turn, _ROUNDS)
         before = int(roadmap.connected.sum())
         ends = _unresolved_at_the_rim(roadmap)
@@ -90,7 +101,11 @@ def repair(roadmap: Roadmap, tolerances: Tolerances, seed: int, progress: Progre
         broken = roadmap.edges[roadmap.resolved[roadmap.edges].all(1) & ~roadmap.connected]
         for side in (0, 1):
             roadmap = _reconsider(roadmap, broken[:, side].unique(), _STARTS, means)
-        if int(roadmap.connected.sum()) == before:
+        last = turn + 1 == _ROUNDS or int(roadmap.connected.sum()) == before
+        named = {name: getattr(roadmap, name) for name in _CHANGING}
+        turns = torch.tensor(_ROUNDS if last else turn + 1)
+        kept.keep({**named, "generator": means.generator.get_state(), "turn": turns}, last=last)
+        if last:
             break
     progress("repairing", _ROUNDS, _ROUNDS)
     return roadmap
@@ -189,8 +204,11 @@ def _take(roadmap: Roadmap, candidates: _Candidates, trial: _Trial, chosen: Tens
     wave[changed] = torch.where(wave[changed] < 0, wave.max() + 1, wave[changed])
     taken = torch.isin(trial.rank, chosen)
     connected[trial.edges[taken]] = trial.joined[taken]
-    resolved = roadmap.resolved.clone()
-    resolved[changed] = True
+    return _changed(roadmap, configurations, connected, wave)
+
+
+def _changed(roadmap: Roadmap, configurations: Tensor, connected: Tensor, wave: Tensor) -> Roadmap:
+    resolved = wave >= 0
     reachable = None if roadmap.reachable is None else roadmap.reachable | resolved
     return replace(
         roadmap,

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from grr_torch.progress import Progress
+from grr_torch.resolution.checkpoint import Stage
 from grr_torch.resolution.objectives import OBJECTIVES
-from grr_torch.resolution.quality import Quality
+from grr_torch.resolution.quality import Quality, edge_slopes
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -15,6 +17,20 @@ if TYPE_CHECKING:
 BEFORE = ("resolved_vertices", "connected_edges", "smoothness", "triangles_wound", "triangles_spread")
 # figures of a map without edges or vertices
 _MAY_BE_NONE = {"smoothness", "smoothest", "mean", "worst"}
+
+
+def before_refinement(roadmap: Roadmap, progress: Progress, kept: Stage) -> dict[str, Any]:
+    """The figures of a roadmap that `parameters["refinement"]` keeps; by name, as in `Quality`."""
+    slopes = edge_slopes(roadmap)
+    cells = roadmap.triangles(progress, kept)
+    figures = (
+        int(roadmap.resolved.sum()),
+        int(roadmap.connected.sum()),
+        float(slopes.mean()) if len(slopes) else None,
+        int(cells.wound.sum()),
+        int(cells.spread_out.sum()),
+    )
+    return dict(zip(BEFORE, figures, strict=True))
 
 
 def check_refinement(parameters: Mapping[str, Any]) -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from grr_torch.progress import Progress, silent
 from grr_torch.resolution.cells import Cells, measure_cells
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.quality import Quality, measure_quality
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import TaskGraph, find_lattice
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
     from grr_torch.applications.differentiable import DifferentiableSolver
     from grr_torch.applications.path import Path
     from grr_torch.applications.solve import Solution, Solver
+
+_EDGES_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +84,8 @@ class Roadmap:
     def quality(self, progress: Progress = silent) -> Quality:
         """Connectivity, smoothness, coverage, cells and residuals, computed once from the tensors.
 
+        Of a roadmap from a file they are those of the file; `grr-torch info FILE --verify` computes them again.
+
         Args:
             progress: Told how many cells are measured.
         """
@@ -95,14 +102,46 @@ class Roadmap:
         Args:
             progress: Told how many cells are measured.
         """
-        if "cells" not in self._measured:
-            corners = self.graph.triangles(self.connected), self.graph.faces(self.connected)
-            self._measured["cells"] = tuple(measure_cells(self, part, progress) for part in corners)
-        return self._measured["cells"]
+        return self.triangles(progress), self.squares(progress)
+
+    def triangles(self, progress: Progress = silent, kept: Stage = UNKEPT) -> Cells:
+        """The first of `cells`, measured once; `kept` is where it is kept how far that is."""
+        if "triangles" not in self._measured:
+            corners = self.graph.triangles(self.connected)
+            self._measured["triangles"] = measure_cells(self, corners, progress, kept)
+        return self._measured["triangles"]
+
+    def squares(self, progress: Progress = silent, kept: Stage = UNKEPT) -> Cells:
+        """The second of `cells`, measured once; `kept` is where it is kept how far that is."""
+        if "squares" not in self._measured:
+            self._measured["squares"] = measure_cells(self, self.graph.faces(self.connected), progress, kept)
+        return self._measured["squares"]
 
     @cached_property
     def _measured(self) -> dict[str, Any]:
         return {}
+
+    def remember(self, quality: Quality) -> None:
+        """Takes the figures of `quality` from where the roadmap was read."""
+        self._measured["quality"] = quality
+
+    @cached_property
+    def neighbours(self) -> tuple[Tensor, Tensor]:
+        """Compressed rows of the connected edges: those of vertex v lead to ends[starts[v] : starts[v + 1]].
+
+        starts (V + 1,) int64 and ends (2 E_q,) int32.
+        """
+        starts, ends = replace(self.graph, edges=self.edges[self.connected]).adjacency
+        return starts, ends.to(torch.int32)
+
+    @cached_property
+    def longest_edge(self) -> float:
+        """How far apart the positions of the ends of an edge are, at most [m]; inf without edges."""
+        columns = self.points[:, : self.task.dimension].T.contiguous()
+        longest = -math.inf
+        for first, second in (part.T for part in self.edges.split(_EDGES_AT_ONCE)):
+            longest = max(longest, float((columns[:, first] - columns[:, second]).square_().sum(0).max()))
+        return math.sqrt(longest) if len(self.edges) else math.inf
 
     @cached_property
     def uncertified(self) -> tuple[Tensor, Tensor]:
@@ -207,7 +246,7 @@ class Roadmap:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the roadmap to one safetensors file (`.grr`), by an atomic rename.
+        """Writes the roadmap to one safetensors file (`.grr`), in pieces and by an atomic rename.
 
         Raises:
             OutputError: It cannot be written.
@@ -218,10 +257,13 @@ class Roadmap:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Roadmap:
-        """Reads a `.grr` file; neither the URDF nor the meshes it was built from are needed.
+        """Opens a `.grr` file; neither the URDF nor the meshes it was built from are needed.
+
+        The tensors are mapped: of the file, only what is used is read. So what they hold is not checked;
+        `grr-torch info FILE --verify` does that.
 
         Raises:
-            FileFormatError: It is missing, truncated, of another version, not a roadmap, or not consistent.
+            FileFormatError: It is missing, truncated, of another version, not a roadmap, or tensors do not fit.
         """
         from grr_torch.resolution.roadmap_file import load_roadmap
 

@@ -11,26 +11,24 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from grr_torch.errors import FileFormatError, GrrError
-from grr_torch.output import atomic_write
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.quality import Quality
 from grr_torch.resolution.report import check_refinement
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.load import make_robot
 from grr_torch.robots.presets import load_preset, robot_names
-from grr_torch.robots.read_urdf import parse_urdf
 from grr_torch.robots.robot import Robot
 from grr_torch.robots.spheres import SphereModel
+from grr_torch.robots.urdf_json import urdf_from_json, urdf_to_json
 from grr_torch.spaces.task import task_from_json
-from grr_torch.tensor_file import read_tensor_file
+from grr_torch.tensor_file import read_tensor_file, tensor_hash, tensors_hash, write_tensors
 from grr_torch.version import __version__
 
 FORMAT = "grr-torch roadmap"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 _DTYPES = {
     "points": torch.float64,
@@ -41,7 +39,15 @@ _DTYPES = {
     "wave": torch.int32,
     "reachable": torch.bool,
 }
-_REQUIRED = tuple(name for name in _DTYPES if name != "reachable")
+# what `Roadmap.solve` needs beside them, and what would take long to find again
+_TABLES = {
+    "neighbour_starts": torch.int64,
+    "neighbour_ends": torch.int32,
+    "uncertified_triangles": torch.int64,
+    "uncertified_squares": torch.int64,
+}
+_REQUIRED = tuple(name for name in (*_DTYPES, *_TABLES) if name != "reachable")
+_TWO_AXES = ("points", "configurations", "edges", "uncertified_triangles", "uncertified_squares")
 
 
 def save_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
@@ -51,26 +57,31 @@ def save_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "package_version": __version__,
-        "robot": _robot_to_json(roadmap.robot),
+        "robot": robot_to_json(roadmap.robot),
         "task": roadmap.task.to_json(),
         "parameters": dict(roadmap.parameters),
         "seed": roadmap.parameters.get("seed"),
         "build_seconds": roadmap.build_seconds,
+        "longest_edge": roadmap.longest_edge,
         "quality": roadmap.quality().to_dict(),
-        "tensors_sha256": tensors_hash(tensors),
+        "tensors_sha256": {name: tensor_hash(tensor) for name, tensor in tensors.items()},
     }
     metadata["metadata_sha256"] = metadata_hash(metadata)
-    with atomic_write(path) as temporary:
-        save_file(tensors, temporary, metadata={key: json.dumps(value) for key, value in metadata.items()})
+    write_tensors(path, tensors, {key: json.dumps(value) for key, value in metadata.items()})
 
 
 def roadmap_hash(roadmap: Roadmap) -> str:
-    """The `tensors_sha256` that a roadmap's file has, by which others name the roadmap that they are made from."""
+    """SHA-256 over the tensors of a roadmap's file, by which others name the roadmap that they are made from."""
     return tensors_hash(_tensors(roadmap))
 
 
-def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
-    """Reads a roadmap; see `Roadmap.load`."""
+def solving_tables(roadmap: Roadmap) -> dict[str, Tensor]:
+    """What a file holds so that it need not be computed before the first point is solved."""
+    return dict(zip(_TABLES, (*roadmap.neighbours, *roadmap.uncertified), strict=True))
+
+
+def load_roadmap(path: str | os.PathLike[str], robot: Robot | None = None) -> Roadmap:
+    """Reads a roadmap; see `Roadmap.load`. A `robot` may be given in place of the file's, as which it was checked."""
     metadata, tensors = read_file(path)
     _check_tensors(path, tensors)
     try:
@@ -80,9 +91,10 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
         for name, hint in get_type_hints(Quality).items():
             if not isinstance(metadata["quality"][name], hint):
                 raise FileFormatError(path, f"has a quality figure '{name}' that is no such number")
-        robot = _robot_from_json(metadata["robot"])
+        robot = robot or _robot_from_json(metadata["robot"])
         task = task_from_json(metadata["task"])
         parameters, seconds = dict(metadata["parameters"]), float(metadata["build_seconds"])
+        longest = float(metadata["longest_edge"])
         Tolerances(**parameters["tolerances"])
         check_refinement(parameters)
     except FileFormatError:
@@ -91,10 +103,11 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
         raise FileFormatError(path, f"has metadata without {error}") from error
     except (TypeError, ValueError, AttributeError, GrrError) as error:
         raise FileFormatError(path, f"has metadata that cannot be used: {error}") from error
+    stored = Quality(**{field.name: metadata["quality"][field.name] for field in fields(Quality)})
     widths = tensors["points"].shape[1], tensors["configurations"].shape[1]
     if widths != (task.width, robot.n):
         raise FileFormatError(path, f"has rows of {widths} entries; its task and robot want {(task.width, robot.n)}")
-    return Roadmap(
+    roadmap = Roadmap(
         robot=robot,
         task=task,
         points=tensors["points"],
@@ -107,6 +120,11 @@ def load_roadmap(path: str | os.PathLike[str]) -> Roadmap:
         parameters=parameters,
         build_seconds=seconds,
     )
+    # what the roadmap would compute when it is first asked for
+    starts, ends, triangles, squares = (tensors[name] for name in _TABLES)
+    vars(roadmap).update(neighbours=(starts, ends), uncertified=(triangles, squares), longest_edge=longest)
+    roadmap.remember(stored)
+    return roadmap
 
 
 def read_file(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -118,16 +136,6 @@ def read_file(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, T
     return read_tensor_file(path, FORMAT, FORMAT_VERSION, "a roadmap")
 
 
-def tensors_hash(tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 over names, shapes and bytes of all tensors."""
-    digest = hashlib.sha256()
-    for name in sorted(tensors):
-        tensor = tensors[name].contiguous()
-        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}".encode())
-        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes() if tensor.numel() else b"")
-    return digest.hexdigest()
-
-
 def metadata_hash(metadata: Mapping[str, Any]) -> str:
     """SHA-256 over everything in the metadata but this hash itself."""
     others = {name: value for name, value in metadata.items() if name != "metadata_sha256"}
@@ -135,18 +143,21 @@ def metadata_hash(metadata: Mapping[str, Any]) -> str:
 
 
 def _tensors(roadmap: Roadmap) -> dict[str, Tensor]:
-    return {
+    tensors = {
         name: getattr(roadmap, name).detach().cpu().contiguous().to(dtype)
         for name, dtype in _DTYPES.items()
         if getattr(roadmap, name) is not None
     }
+    return tensors | solving_tables(roadmap)
 
 
-def _robot_to_json(robot: Robot) -> dict[str, Any]:
+def robot_to_json(robot: Robot) -> dict[str, Any]:
+    """All that makes a robot."""
     return {
         "name": robot.name,
         "bundled": robot.preset is not None,
         "urdf": robot.urdf.text,
+        "parsed": urdf_to_json(robot.urdf),
         "urdf_sha256": hashlib.sha256(robot.urdf.text.encode()).hexdigest(),
         "urdf_directory": None if robot.preset or not robot.urdf.directory else str(robot.urdf.directory),
         "package_dirs": [str(folder.resolve()) for folder in robot.urdf.package_dirs],
@@ -163,9 +174,9 @@ def _robot_from_json(data: dict[str, Any]) -> Robot:
     directory = data["urdf_directory"]
     if data["bundled"] and data["name"] in robot_names():
         directory = load_preset(data["name"]).urdf.parent
-    urdf = parse_urdf(
-        data["urdf"].encode(),
-        source=data["name"],
+    urdf = urdf_from_json(
+        data["parsed"],
+        text=data["urdf"],
         directory=None if directory is None else Path(directory),
         package_dirs=data["package_dirs"],
     )
@@ -184,10 +195,10 @@ def _robot_from_json(data: dict[str, Any]) -> Robot:
 
 
 def _check_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> None:
-    """Names, types, shapes, and what must agree between them.
+    """Names, types and shapes; what the tensors hold is not read.
 
     Raises:
-        FileFormatError: Something does not.
+        FileFormatError: Something does not fit.
     """
 
     def demand(holds: bool, reason: str) -> None:
@@ -196,24 +207,16 @@ def _check_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) 
 
     missing = [name for name in _REQUIRED if name not in tensors]
     demand(not missing, f"lacks the tensors {', '.join(missing)}")
+    dtypes = _DTYPES | _TABLES
     for name, tensor in tensors.items():
-        demand(name in _DTYPES, f"has an unknown tensor '{name}'")
-        demand(tensor.dtype == _DTYPES[name], f"tensor '{name}' is {tensor.dtype}, not {_DTYPES[name]}")
-    for name, tensor in tensors.items():
-        axes = 2 if name in ("points", "configurations", "edges") else 1
+        demand(name in dtypes, f"has an unknown tensor '{name}'")
+        demand(tensor.dtype == dtypes[name], f"tensor '{name}' is {tensor.dtype}, not {dtypes[name]}")
+        axes = 2 if name in _TWO_AXES else 1
         demand(tensor.ndim == axes, f"tensor '{name}' has {tensor.ndim} axes, not {axes}")
     vertices, count = len(tensors["points"]), len(tensors["edges"])
     lengths = {"configurations": vertices, "resolved": vertices, "wave": vertices, "connected": count}
     lengths |= {"reachable": vertices} if "reachable" in tensors else {}
-    for name, length in lengths.items():
+    for name, length in {**lengths, "neighbour_starts": vertices + 1}.items():
         demand(len(tensors[name]) == length, f"tensor '{name}' has {len(tensors[name])} rows, not {length}")
-    edges, resolved = tensors["edges"], tensors["resolved"]
-    inside = bool(((edges >= 0) & (edges < vertices)).all()) and edges.shape[1] == 2
-    demand(inside, "has edges to vertices that do not exist")
-    demand(bool(tensors["points"].isfinite().all()), "has points that are not finite")
-    finite = tensors["configurations"].isfinite().all(1)
-    demand(bool((finite == resolved).all()), "has resolved vertices without a finite configuration, or the reverse")
-    demand(bool((tensors["wave"] < vertices).all()), "has waves later than there are vertices")
-    demand(bool((tensors["wave"] >= 0).eq(resolved).all()), "has waves that do not fit what is resolved")
-    demand(not bool((resolved & ~tensors.get("reachable", resolved)).any()), "has resolved vertices not reachable")
-    demand(bool(resolved[edges[tensors["connected"]]].all()), "has connected edges to unresolved vertices")
+    for name, width in {"edges": 2, "uncertified_triangles": 3, "uncertified_squares": 4}.items():
+        demand(tensors[name].shape[1] == width, f"tensor '{name}' has rows of {tensors[name].shape[1]}, not {width}")

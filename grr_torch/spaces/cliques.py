@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+# edges or cycles that are looked at together
+_AT_ONCE = 1 << 17
+
 
 def triangles(edges: Tensor, vertices: int) -> Tensor:
     """(C, 3) all triangles of a graph, smallest vertex first.
@@ -13,24 +16,31 @@ def triangles(edges: Tensor, vertices: int) -> Tensor:
         edges: (E, 2) edges.
         vertices: How many vertices there are.
     """
-    edges = edges.sort(dim=1).values
-    keys, order = (edges[:, 0] * vertices + edges[:, 1]).sort()
-    first, second = edges[order].unbind(1)
-    starts = torch.searchsorted(first.contiguous(), torch.arange(vertices + 1))
-    # of every edge (a, b), the edges (a, c) with c > b: is (b, c) one too?
-    counts = starts[first + 1] - torch.arange(len(first)) - 1
-    edge = torch.repeat_interleave(torch.arange(len(first)), counts)
-    beyond = edge + 1 + torch.arange(len(edge)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
-    there = _are_edges(keys, second[edge] * vertices + second[beyond])
-    edge, beyond = edge[there], beyond[there]
-    return torch.stack([first[edge], second[edge], second[beyond]], dim=1)
+    first, second = edges.amin(1), edges.amax(1)
+    keys, order = (first * vertices + second).sort()
+    first, second = first[order], second[order]
+    starts = torch.searchsorted(first, torch.arange(vertices + 1))
+    found: list[Tensor] = [edges.new_empty(0, 3)]
+    for part in torch.arange(len(keys)).split(_AT_ONCE):
+        # of every edge (a, b), the edges (a, c) with c > b: is (b, c) one too?
+        counts = starts[first[part] + 1] - part - 1
+        edge = torch.repeat_interleave(part, counts)
+        beyond = edge + 1 + torch.arange(len(edge)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
+        there = _are_edges(keys, second[edge] * vertices + second[beyond])
+        edge, beyond = edge[there], beyond[there]
+        found.append(torch.stack([first[edge], second[edge], second[beyond]], dim=1))
+    return torch.cat(found)
 
 
 def closed(corners: Tensor, edges: Tensor, vertices: int) -> Tensor:
     """Those of cycles, given by their corners (C, k) in order, all of whose sides are edges (E, 2), smaller first."""
     keys = (edges[:, 0] * vertices + edges[:, 1]).sort().values
-    sides = torch.stack([corners, corners.roll(-1, dims=1)], dim=-1).sort(dim=-1).values
-    return corners[_are_edges(keys, sides[..., 0] * vertices + sides[..., 1]).all(1)]
+    found: list[Tensor] = [corners[:0]]
+    for part in corners.split(_AT_ONCE):
+        following = part.roll(-1, dims=1)
+        wanted = torch.minimum(part, following) * vertices + torch.maximum(part, following)
+        found.append(part[_are_edges(keys, wanted).all(1)])
+    return torch.cat(found)
 
 
 def draw(count: int, most: int, seed: int = 0) -> Tensor:

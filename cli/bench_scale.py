@@ -1,0 +1,79 @@
+"""`grr-torch bench scale`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+
+if TYPE_CHECKING:
+    from grr_torch.experiments.scale import Size
+
+_COLUMNS = {
+    "edges": ("edges", "{:,.0f}"),
+    "resolved": ("resolved", "{:,.0f}"),
+    "seconds": ("build [s]", "{:.3g}"),
+    "cell_seconds": ("cells [s]", "{:.3g}"),
+    "cpu_seconds": ("CPU [s]", "{:.3g}"),
+    "peak_mib": ("peak [MiB]", "{:,.0f}"),
+    "save_seconds": ("write [s]", "{:.3g}"),
+    "file_mib": ("file [MiB]", "{:,.1f}"),
+    "load_seconds": ("load [s]", "{:.3f}"),
+    "first_seconds": ("first point [s]", "{:.3f}"),
+    "next_seconds": ("one more [s]", "{:.4f}"),
+    "process_seconds": ("solve, process − torch [s]", "{:.2f}"),
+}
+
+
+@reports_errors
+def scale(
+    robot: Annotated[str, typer.Option(help="A bundled robot.")] = "kinova",
+    task: Annotated[str | None, typer.Option(help="A task of its preset; the default one by default.")] = None,
+    points: Annotated[
+        list[int] | None, typer.Option(help="Vertices asked for; repeatable; 1000, 10000, 100000, 1000000 by default.")
+    ] = None,
+    refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Whether roadmaps are refined.")] = True,
+    repeats: Annotated[int, typer.Option(min=1, help="Opening and solving: medians over so many processes.")] = 3,
+    plot: Annotated[Path | None, typer.Option(help="Draw all figures into this PNG file.", metavar="FILE.png")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+) -> None:
+    """Print how time, memory, file size and opening grow with the vertices, as a Markdown table.
+
+    The last line has exponents, fitted to sizes above 10,000: 1 is a straight line. A million refined vertices take
+    minutes.
+
+    Example: grr-torch bench scale --points 1000 --points 10000 --points 100000 --plot scale.png
+    """
+    from grr_torch.errors import ParameterError
+    from grr_torch.experiments.scale import SIZES, exponents, measure_scale
+    from grr_torch.experiments.scale import plot as draw
+    from grr_torch.experiments.timing import machine
+    from grr_torch.output import atomic_write, check_writable
+
+    if plot is not None and plot.suffix != ".png":
+        raise ParameterError("--plot", plot, "a file that ends in .png")
+    for file in (plot, json_file):
+        if file is not None:
+            check_writable(file)
+    with progress_bar() as progress:
+        rows = measure_scale(robot, task, sizes=points or SIZES, refine=refine, repeats=repeats, progress=progress)
+    powers = exponents(rows)
+    if json_file is not None:
+        data = {"machine": machine(), "sizes": [row.__dict__ for row in rows], "exponents": powers}
+        with atomic_write(json_file) as path:
+            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
+    if plot is not None:
+        with atomic_write(plot) as path:
+            draw(rows, path)
+    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    lines = [_line(row) for row in rows]
+    if powers:
+        lines.append(["exponent", *(f"{powers[name]:.2f}" for name in _COLUMNS)])
+    typer.echo(markdown_table(["vertices", *(head for head, _ in _COLUMNS.values())], lines))
+
+
+def _line(row: Size) -> list[str]:
+    return [f"{row.vertices:,}", *(shape.format(getattr(row, name)) for name, (_, shape) in _COLUMNS.items())]

@@ -1,0 +1,131 @@
+"""Memory: what a build will take at its peak, and what is there; asked before it starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from grr_torch.errors import ParameterError
+from grr_torch.projection.project import DEFAULT_TOLERANCES
+from grr_torch.resolution.problem import Problem
+from grr_torch.resolution.reachability import from_random_starts, within_reach
+from grr_torch.robots.robot import Robot
+
+# bytes at the peak: of a vertex and an edge of the graph, and by joint of those that are resolved or connected, with
+# and without refinement. Fitted to builds of 30,000 to 1,000,000 vertices
+_VERTEX, _EDGE = 60, 80
+_RESOLVED = {False: 150, True: 280}
+_CONNECTED = {False: 20, True: 40}
+# what a fit of the measured peaks leaves over
+_MARGIN = 1.2
+# whatever the size: pieces that are worked on
+_LEAST = 64 << 20
+# vertices of which it is tried how many can be resolved, and the starts of each
+_TRIED, _STARTS = 400, 4
+
+
+def require_memory(robot: Robot, problem: Problem, refine: bool) -> None:
+    """Checks that a build will fit the memory that is free.
+
+    Raises:
+        ParameterError: It will not.
+    """
+    free = available_memory()
+    if free is None or estimate_memory(robot, problem, refine, 1.0) <= free:
+        return
+    share = _resolvable(robot, problem)
+    wanted = estimate_memory(robot, problem, refine, share)
+    if wanted <= free:
+        return
+    vertices = len(problem.graph.points)
+    fitting = int(vertices * max(free - _LEAST, 0) / (wanted - _LEAST))
+    valid = f"about {fitting:,} vertices"
+    if refine and estimate_memory(robot, problem, False, share) <= free:
+        valid += ", or no refinement"
+    what = f"{vertices:,} vertices, which would take about {_gibibytes(wanted)}"
+    raise ParameterError("points", what, f"{valid}, with the {_gibibytes(free)} that are free")
+
+
+def estimate_memory(robot: Robot, problem: Problem, refine: bool, share: float) -> int:
+    """Bytes that a build takes at its peak, besides what the process holds already.
+
+    Args:
+        robot: The robot.
+        problem: What is built for.
+        refine: Whether the roadmap will be refined.
+        share: How many of the vertices within the arm's reach will be resolved.
+    """
+    graph = problem.graph
+    near = within_reach(robot, problem.task, graph.points)
+    resolved = share * int(near.sum())
+    connected = share * int(near[graph.edges].all(1).sum())
+    of_graph = _VERTEX * len(graph.points) + _EDGE * len(graph.edges)
+    of_map = robot.n * (_RESOLVED[refine] * resolved + _CONNECTED[refine] * connected)
+    return int(_LEAST + _MARGIN * (of_graph + of_map))
+
+
+def available_memory() -> int | None:
+    """Bytes that this process may still take, by the system and by the limits of its control group; None if unknown."""
+    found = [_system_memory(), *_group_memory()]
+    known = [value for value in found if value is not None]
+    return max(0, min(known)) if known else None
+
+
+def _resolvable(robot: Robot, problem: Problem) -> float:
+    """About which share of the vertices within the arm's reach can be resolved, by random starts at some of them."""
+    generator = torch.Generator().manual_seed(0)
+    near = within_reach(robot, problem.task, problem.graph.points).nonzero()[:, 0]
+    tried = near[torch.randint(len(near), (_TRIED,), generator=generator)]
+    points = problem.graph.points[tried]
+    reached = from_random_starts(robot, problem.task, points, _STARTS, generator, DEFAULT_TOLERANCES)[1].any(1)
+    return min(1.0, float(reached.double().mean()) + 0.05)
+
+
+def _system_memory() -> int | None:
+    for line in _lines(Path("/proc/meminfo")):
+        if line.startswith("MemAvailable:"):
+            return 1024 * int(line.split()[1])
+    return None
+
+
+def _group_memory(root: Path = Path("/sys/fs/cgroup"), process: Path = Path("/proc/self/cgroup")) -> list[int]:
+    """What is left of the limits of this process's control group and of those above it, of both versions."""
+    left: list[int] = []
+    for line in _lines(process):
+        number, controllers, group = line.split(":", 2)
+        if number == "0":
+            top, names = root, ("memory.max", "memory.current", "inactive_file")
+        elif "memory" in controllers.split(","):
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+            top = root / "memory"
+        else:
+            continue
+        folder = top / group.strip("/")
+        # in a container, the group's own folder may not be seen, but its root is then the group
+        for place in (folder, *(parent for parent in folder.parents if parent.is_relative_to(top))):
+            limit, used = _number(place / names[0]), _number(place / names[1])
+            if limit is not None and used is not None:
+                left.append(limit - used + _cached(place / "memory.stat", names[2]))
+    return left
+
+
+def _cached(path: Path, name: str) -> int:
+    """Bytes of files that are only remembered: they count as used, but are given back at need."""
+    return next((int(line.split()[1]) for line in _lines(path) if line.startswith(f"{name} ")), 0)
+
+
+def _number(path: Path) -> int | None:
+    text = "".join(_lines(path)).strip()
+    return int(text) if text.isdigit() else None
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return []
+
+
+def _gibibytes(size: float) -> str:
+    return f"{size / 2**30:.1f} GiB"
