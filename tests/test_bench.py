@@ -113,7 +113,7 @@ def test_every_section_is_in_the_help():
 
 
 def test_the_parts_of_a_projection_are_counted_where_they_run(kinova):
-    cost = projection_cost(kinova, count=200, repeats=2)
+    cost = projection_cost(kinova, count=700, repeats=2)
     parts = {part.name: part for part in cost.parts}
     evaluated, stepped = parts["poses of the frames"], parts["steps: damped least squares"]
     # every pose is evaluated at least once more than it is stepped, and nearly all need two steps or more

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from grr_torch.pieces import one_thread, slices
+from grr_torch.pieces import FEW, one_thread, slices
 from grr_torch.projection.project import project_columns
 from grr_torch.projection.step import Equations, free_step, stop_at_limits
 from grr_torch.robots.kinematics import KinematicTree
@@ -26,8 +26,8 @@ from grr_torch.spaces.task import Position
 
 # how far from a solution the projection starts, in every joint [rad]
 _PERTURBATION = 0.3
-# columns of a call that is all overhead; fewer are computed in another way
-_NARROW = 32
+# columns of the narrow calls by which the overhead of calls is told; fewer are computed in another way
+_NARROW = FEW + 1
 # operators that only make memory, or give its shape
 _NO_ARITHMETIC = ("empty", "new_empty", "empty_like", "detach", "_local_scalar_dense")
 
@@ -149,7 +149,7 @@ def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> Proj
 
     Args:
         robot: The robot, on the CPU.
-        count: How many poses.
+        count: How many poses; more than are computed as a few.
         repeats: Medians are taken over so many runs.
     """
     targets, q = PoseProblem.sample(robot, count).columns()
@@ -162,7 +162,7 @@ def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> Proj
     calls = _record(run)
     with torch.no_grad(), one_thread():
         width = slices(count, q.device)[0].stop
-        wide, narrow = (_calls(robot, task, targets[:, :size], q[:, :size]) for size in (width, min(_NARROW, width)))
+        wide, narrow = (_calls(robot, task, targets[:, :size], q[:, :size]) for size in (width, _NARROW))
         one, two = torch.ones(2, 6, width, dtype=q.dtype)
         left, right, out = (torch.ones(size, dtype=q.dtype) for size in ((5, 4), (4, 3 * width), (5, 3 * width)))
         parts = []
@@ -170,7 +170,9 @@ def projection_cost(robot: Robot, count: int = 10_000, repeats: int = 7) -> Proj
             seconds = sum(_cpu_seconds(call, repeats) for _, call in calls[name])
             part = Part(name, sum(size for size, _ in calls[name]) / count, len(calls[name]), seconds / count)
             if name in wide:
-                counter, waiting = count_operators(wide[name]), _cpu_seconds(narrow[name], repeats)
+                counter = count_operators(wide[name])
+                pair = [_cpu_seconds(call[name], repeats) for call in (wide, narrow)]
+                waiting = max(0.0, (pair[1] * width - pair[0] * _NARROW) / (width - _NARROW))
                 part = replace(
                     part,
                     waiting=part.calls * waiting / count,

@@ -145,9 +145,16 @@ class TaskSpace(ABC):
         return torch.cat([translation, self.rotation_error(targets, rotation)])
 
     def error_of_few(self, targets: Array, position: Array, rotation: Array) -> Array:
-        """`error` for arrays: what a space has no faster way for is left to torch."""
-        tensors = (torch.from_numpy(np.ascontiguousarray(array)) for array in (targets, position, rotation))
-        return self.error(*tensors).numpy()
+        """`error` for arrays."""
+        translation = targets[: self.dimension] - position[: self.dimension]
+        if self.constraints == self.dimension:
+            return translation
+        return np.concatenate([translation, self.rotation_error_of_few(targets, rotation)])
+
+    def rotation_error_of_few(self, targets: Array, rotation: Array) -> Array:
+        """`rotation_error` for arrays: what a space has no faster way for is left to torch."""
+        tensors = (torch.from_numpy(np.ascontiguousarray(array)) for array in (targets, rotation))
+        return self.rotation_error(*tensors).numpy()
 
     def jacobian(self, jacobian: Tensor, targets: Tensor | None = None) -> Tensor:
         """Rows (constraints, n, N) of a geometric Jacobian (6, n, N) that answer to `error`.

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,10 +43,6 @@ class Position(TaskSpace):
     def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
         """No rows."""
         return rotation[0, :0]
-
-    def error_of_few(self, targets: Array, position: Array, rotation: Array) -> Array:
-        """`error` for arrays."""
-        return targets - position[: self.dimension]
 
     def to_json(self) -> dict[str, Any]:
         """Kind and dimension."""
@@ -97,12 +92,11 @@ class FixedRotation(TaskSpace):
             return wrap(self.rpy[2] - torch.atan2(rotation[1, 0], rotation[0, 0]))[None]
         return rotation_error(self.rotation.to(rotation)[..., None], rotation)
 
-    def error_of_few(self, targets: Array, position: Array, rotation: Array) -> Array:
-        """`error` for arrays."""
+    def rotation_error_of_few(self, targets: Array, rotation: Array) -> Array:
+        """`rotation_error` for arrays."""
         if self.dimension == 2:
-            return super().error_of_few(targets, position, rotation)
-        turned = rotation_error_of_few(self.rotation.numpy(), rotation)
-        return np.concatenate([targets - position, turned])
+            return super().rotation_error_of_few(targets, rotation)
+        return rotation_error_of_few(self.rotation.numpy(), rotation)
 
     def to_json(self) -> dict[str, Any]:
         """Kind, dimension and angles."""
