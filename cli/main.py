@@ -9,12 +9,14 @@ from typing import Annotated
 import typer
 from grr_torch.cli.bench import app as bench
 from grr_torch.cli.build import build
+from grr_torch.cli.catalogue import catalogue
 from grr_torch.cli.info import info
 from grr_torch.cli.plan import plan
 from grr_torch.cli.robots import robots
 from grr_torch.cli.smm import smm
 from grr_torch.cli.solve import solve
 from grr_torch.cli.spheres import spheres
+from grr_torch.cli.sweep import sweep
 from grr_torch.cli.teleop import teleop
 from grr_torch.cli.view import view
 
@@ -29,7 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for command in (robots, build, info, view, solve, plan, teleop, smm, spheres):
+for command in (robots, build, info, view, solve, plan, teleop, smm, spheres, sweep, catalogue):
     app.command()(command)
 app.add_typer(bench)
 
