@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 # seconds that an address has to take a connection, and then to answer as a cluster
-_CONNECT, _ANSWER = 5.0, 40.0
+_CONNECT, _ANSWER = 5.0, 20.0
 # for a cluster started here: nothing is sent to anyone, and it listens on the loopback interface alone
 _PRIVATE = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 _SHARED_MEMORY = 1 << 28
@@ -51,7 +51,7 @@ def cluster(address: str | None = None, *, cpus: int | None = None) -> Iterator[
         with _own_cluster(ray, cpus):
             yield ray
         return
-    _check_answers(address)
+    check_answers(address)
     ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     try:
         yield ray
@@ -96,7 +96,7 @@ def _own_cluster(ray: Any, cpus: int | None) -> Iterator[None]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _check_answers(address: str) -> None:
+def check_answers(address: str) -> None:
     """Finds out in seconds whether a cluster answers: Ray itself would wait for minutes.
 
     Raises:
