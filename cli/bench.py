@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.bench_cluster import cluster
 from grr_torch.cli.bench_teleop import teleop
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
@@ -19,6 +20,7 @@ app = typer.Typer(name="bench", help="Measure: the tables of the README.", no_ar
 
 
 app.command()(teleop)
+app.command()(cluster)
 
 
 @app.callback()

@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from grr_torch.cli.show import progress_bar, reports_errors
-
-ENGINES = ("local", "ray")
+from grr_torch.cli.show import ENGINES, progress_bar, reports_errors
 
 
 @reports_errors

@@ -19,7 +19,9 @@ from test_sweep import FLEET, SMALL, orders_of, stamps
 
 import grr_torch
 from grr_torch.errors import GrrWarning, ParameterError
+from grr_torch.experiments.cluster import measure_cluster
 from grr_torch.fleet import cluster as cluster_module
+from grr_torch.fleet import edges
 from grr_torch.fleet.catalogue import read_catalogue
 from grr_torch.fleet.order import Needs
 from grr_torch.fleet.ray_engine import RayEngine
@@ -35,6 +37,15 @@ if importlib.util.find_spec("ray") is None:  # not imported: clusters that are s
 def ray():
     with cluster_module.cluster(cpus=2) as connected:
         yield connected
+
+
+def test_what_a_cluster_costs_is_measured():
+    cost = measure_cluster("planar_3", points=900, workers=1, repeats=1)
+    assert list(cost.cluster_seconds) == [1]
+    assert 0 < cost.checked <= cost.edges
+    assert min(cost.check_seconds, cost.refinement_seconds, *cost.cluster_seconds.values()) > 0.0
+    # points and configurations as float64, resolved, wave; two vertices, connected
+    assert (cost.bytes_vertex, cost.bytes_edge) == ((2 + 3) * 8 + 1 + 4, 2 * 8 + 1)
 
 
 def killed(marks: Path, victim: str, times: int):
@@ -133,6 +144,27 @@ def test_the_driver_killed_and_started_again_does_only_the_rest(tmp_path):
     assert {row["status"] for row in rows} == {"done"}
     assert len(read_catalogue(folder)) == len(orders)
     assert not list(folder.glob(".*partial*"))
+
+
+@pytest.mark.parametrize("refine", [False, True])
+def test_a_build_whose_edges_are_checked_by_workers_gives_equal_tensors(ray, planar_5, monkeypatch, refine):
+    monkeypatch.setattr(edges, "_LEAST", 16)
+    options = {"task": "position", "points": 200, "refine": refine}
+    alone = grr_torch.build(planar_5, **options)
+    spread = grr_torch.build(planar_5, **options, check=edges.SpreadCheck(ray))
+    for name in ("points", "configurations", "resolved", "edges", "connected", "wave"):
+        torch.testing.assert_close(getattr(spread, name), getattr(alone, name), rtol=0, atol=0, equal_nan=True)
+
+
+def test_workers_judge_edges_as_this_process_does(ray, planar_5, generator, monkeypatch):
+    monkeypatch.setattr(edges, "_LEAST", 16)
+    task = grr_torch.Position(2)
+    q = [planar_5.sample(301, generator)]
+    q.append(q[0] + torch.linspace(0.0, 1.0, 301, dtype=torch.float64)[:, None])
+    p = [planar_5.forward_kinematics(part)[0][..., :2] for part in q]
+    found = edges.SpreadCheck(ray)(planar_5, task, *p, *q)
+    assert torch.equal(found, grr_torch.is_continuous(planar_5, task, *p, *q))
+    assert 0 < int(found.sum()) < len(found)
 
 
 def test_a_cluster_that_answers_is_joined(ray, tmp_path):

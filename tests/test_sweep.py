@@ -275,6 +275,9 @@ def test_the_commands_say_what_they_did(fleet, tmp_path):
         ("sweep s.yaml --engine rey", "unknown engine 'rey'. Did you mean 'ray'?"),
         ("sweep s.yaml --address auto", "none without --engine ray"),
         ("sweep s.yaml --out s.yaml", "--out: got s.yaml; valid: a folder"),
+        ("build --robot planar_5 --engine rey", "unknown engine 'rey'. Did you mean 'ray'?"),
+        ("build --robot planar_5 --address auto", "none without --engine ray"),
+        ("build --robot planar_5 --engine ray --device cuda", "cpu with --engine ray"),
         ("catalogue none", "none: is not a folder"),
         ("catalogue . --best smothness", "Did you mean 'smoothness'?"),
         ("catalogue . --per task", "none without --best"),
@@ -287,6 +290,13 @@ def test_a_mistake_ends_with_exit_code_2(tmp_path, monkeypatch, words, complaint
     assert result.exit_code == 2
     assert complaint in result.stderr
     assert result.stdout == ""
+
+
+@pytest.mark.parametrize("command", [["sweep"], ["catalogue"], ["bench", "cluster"]])
+def test_help_has_an_example(command):
+    result = CliRunner().invoke(app, [*command, "--help"])
+    assert result.exit_code == 0
+    assert f"Example: grr-torch {' '.join(command)}" in result.stdout
 
 
 def test_ctrl_c_ends_with_130_and_the_next_run_goes_on(tmp_path):

@@ -39,12 +39,13 @@ def cluster(address: str | None = None, *, cpus: int | None = None) -> Iterator[
 
     Raises:
         MissingPackageError: Ray is not installed.
-        ParameterError: No cluster answers at the address.
+        ParameterError: No cluster answers at the address, or this process is in one already.
     """
     ray = _import_ray()
     if ray.is_initialized():
-        if address is not None:
-            raise ParameterError("address", address, "none: this process is in a cluster already")
+        for name, value in (("address", address), ("cpus", cpus)):
+            if value is not None:
+                raise ParameterError(name, value, "none: this process is in a cluster already")
         yield ray
         return
     if address is None:

@@ -16,7 +16,10 @@ from grr_torch.robots.load import load_robot
 from grr_torch.spaces.task import make_task
 
 # arguments that a file cannot hold, or that are named otherwise there
-_NOT_NAMED = {"name_or_path", "robot", "dtype", "kind", "dimension", "tolerances", "checkpoint", "resume", "progress"}
+_NOT_NAMED = {
+    *("name_or_path", "robot", "dtype", "kind", "dimension"),
+    *("tolerances", "check", "checkpoint", "resume", "progress"),
+}
 _RENAMED = {"rpy": "rotation"}
 _SIMPLE = {bool: "true or false", int: "a whole number", float: "a number", str: "text", types.NoneType: "null"}
 

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError, UnknownNameError, check_seed
 from grr_torch.progress import Progress, silent
+from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
 from grr_torch.resolution.auto_seeds import CANDIDATES, find_seeds
-from grr_torch.resolution.edges import continuous_edges
+from grr_torch.resolution.edges import EdgeCheck, continuous_edges
 from grr_torch.resolution.expand import default_neighbours, expand
 from grr_torch.resolution.objectives import check_objectives
 from grr_torch.resolution.problem import Problem, pose_problem
@@ -46,6 +47,7 @@ def build(
     reachability: int = 0,
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
+    check: EdgeCheck = is_continuous,
     progress: Progress = silent,
 ) -> Roadmap:
     """Builds a roadmap with Expansion-GRR, or with the baseline Random-GRR, and refines it.
@@ -69,6 +71,7 @@ def build(
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. On the CPU the same inputs give the same tensors.
         tolerances: When a configuration counts as being at a point.
+        check: What checks batches of edges: `is_continuous`, or a `grr_torch.fleet.edges.SpreadCheck` on a cluster.
         progress: Told what is being done and how far it is.
 
     Returns:
@@ -92,12 +95,12 @@ def build(
         parts = _at_random(robot, problem, samples, seed, tolerances, progress)
     else:
         problem = _with_seeds(robot, problem, candidates, seed, tolerances, progress)
-        parts = _expanded(robot, problem, neighbours, tolerances, progress)
+        parts = _expanded(robot, problem, neighbours, tolerances, check, progress)
     seconds = time.perf_counter() - begin
     settings = {"margin": robot.margin, "seed": seed, "reachability": reachability, "tolerances": asdict(tolerances)}
     roadmap = _assemble(robot, problem, parts, {"method": method, **parts.chosen, **settings}, seconds)
     if refine:
-        roadmap = refine_roadmap(roadmap, objectives=objectives, seed=seed, progress=progress)
+        roadmap = refine_roadmap(roadmap, objectives=objectives, seed=seed, check=check, progress=progress)
     if not reachability:
         return roadmap
     left = ~roadmap.resolved
@@ -145,13 +148,18 @@ def _with_seeds(
 
 
 def _expanded(
-    robot: Robot, problem: Problem, neighbours: int | None, tolerances: Tolerances, progress: Progress
+    robot: Robot,
+    problem: Problem,
+    neighbours: int | None,
+    tolerances: Tolerances,
+    check: EdgeCheck,
+    progress: Progress,
 ) -> _Parts:
     task, graph, table = problem
     assert not isinstance(table, str)
     expansion = expand(robot, task, graph, table, neighbours=neighbours, tolerances=tolerances, progress=progress)
     found = expansion.configurations, expansion.resolved
-    connected = continuous_edges(robot, task, graph.points, *found, graph.edges, tolerances, progress)
+    connected = continuous_edges(robot, task, graph.points, *found, graph.edges, tolerances, progress, check)
     chosen = {
         "neighbours": default_neighbours(task) if neighbours is None else neighbours,
         "seeds": torch.as_tensor(table, dtype=torch.float64).tolist(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 # edges that are checked together
 _AT_ONCE = 16384
 
+# `is_continuous`, or what gives the same by other means
+EdgeCheck = Callable[..., Tensor]
+
 
 def check_edges(roadmap: Roadmap, tolerances: Tolerances, progress: Progress = silent) -> Tensor:
     """Which edges of a roadmap are continuous, checked anew: (E,) bool."""
@@ -35,6 +39,7 @@ def continuous_edges(
     edges: Tensor,
     tolerances: Tolerances,
     progress: Progress,
+    check: EdgeCheck = is_continuous,
 ) -> Tensor:
     """Which edges between resolved vertices are continuous: (E,) bool, on the robot's device.
 
@@ -47,6 +52,7 @@ def continuous_edges(
         edges: (E, 2) vertices of each edge.
         tolerances: Of the projections.
         progress: Told how many edges are checked.
+        check: What checks a batch of edges.
     """
     configurations, resolved, edges = (part.to(robot.device) for part in (configurations, resolved, edges))
     configurations = configurations.to(robot.dtype)
@@ -58,6 +64,6 @@ def continuous_edges(
         part = candidates[start : start + _AT_ONCE]
         a, b = edges[part].T
         ends = points[a], points[b], configurations[a], configurations[b]
-        connected[part] = is_continuous(robot, task, *ends, tolerances=tolerances)
+        connected[part] = check(robot, task, *ends, tolerances=tolerances)
     progress("checking edges", len(candidates), len(candidates))
     return connected

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from grr_torch.progress import Progress, silent
+from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.cells import triangles
 from grr_torch.resolution.certify import certify
-from grr_torch.resolution.edges import continuous_edges
+from grr_torch.resolution.edges import EdgeCheck, continuous_edges
 from grr_torch.resolution.objectives import Objective, check_objectives, measure_objective
 from grr_torch.resolution.quality import edge_slopes
 from grr_torch.resolution.relax import Network, relax
@@ -27,7 +28,12 @@ _LEAST_SCALE = 1e-9
 
 
 def refine(
-    roadmap: Roadmap, *, objectives: Mapping[str, float] | None = None, seed: int = 0, progress: Progress = silent
+    roadmap: Roadmap,
+    *,
+    objectives: Mapping[str, float] | None = None,
+    seed: int = 0,
+    check: EdgeCheck = is_continuous,
+    progress: Progress = silent,
 ) -> Roadmap:
     """Improves a roadmap: more vertices, more edges, and a smaller mean of D_q / D_p.
 
@@ -40,6 +46,7 @@ def refine(
         roadmap: The roadmap.
         objectives: Weights of "clearance", "manipulability" and "limits"; one with weight 0 is only reported.
         seed: Of the random starts.
+        check: What checks batches of edges.
         progress: Told what is being done and how far it is.
 
     Returns:
@@ -54,9 +61,9 @@ def refine(
     before = roadmap.quality(progress)
     begin = time.perf_counter()
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
-    smoothest = _relaxed(repair(roadmap, tolerances, seed, progress), {}, tolerances, progress)
+    smoothest = _relaxed(repair(roadmap, tolerances, seed, progress), {}, tolerances, check, progress)
     wanted = {name: weight for name, weight in weights.items() if weight > 0.0}
-    refined = _relaxed(smoothest, wanted, tolerances, progress) if wanted else smoothest
+    refined = _relaxed(smoothest, wanted, tolerances, check, progress) if wanted else smoothest
     seconds = time.perf_counter() - begin
     told: dict[str, Any] = {**{name: getattr(before, name) for name in BEFORE}, "seconds": seconds}
     if weights:
@@ -82,7 +89,9 @@ def _figures(roadmap: Roadmap, objective: str) -> dict[str, float | None]:
     return {"mean": float(values.mean()), "worst": float(values.min())}
 
 
-def _relaxed(roadmap: Roadmap, weights: Mapping[str, float], tolerances: Tolerances, progress: Progress) -> Roadmap:
+def _relaxed(
+    roadmap: Roadmap, weights: Mapping[str, float], tolerances: Tolerances, check: EdgeCheck, progress: Progress
+) -> Roadmap:
     """The relaxed and certified map, but for the surroundings of edges that it would break."""
     edges = roadmap.edges[roadmap.connected]
     if len(edges) == 0:
@@ -96,7 +105,7 @@ def _relaxed(roadmap: Roadmap, weights: Mapping[str, float], tolerances: Toleran
     new = certify(network, cells, new, tolerances, progress).T
     configurations = roadmap.configurations.clone()
     configurations[vertices] = new.cpu()
-    return _without_losses(roadmap, configurations, tolerances, progress)
+    return _without_losses(roadmap, configurations, tolerances, check, progress)
 
 
 def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping[str, float]) -> Network:
@@ -113,7 +122,9 @@ def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping
     return Network(robot, task, points.T.contiguous(), edges.T.contiguous().to(robot.device), lengths, objectives)
 
 
-def _without_losses(roadmap: Roadmap, configurations: Tensor, tolerances: Tolerances, progress: Progress) -> Roadmap:
+def _without_losses(
+    roadmap: Roadmap, configurations: Tensor, tolerances: Tolerances, check: EdgeCheck, progress: Progress
+) -> Roadmap:
     """The roadmap with new configurations, but with its own round edges that would be lost."""
     connected = torch.zeros_like(roadmap.connected)
     stale = torch.ones_like(roadmap.connected)
@@ -122,7 +133,7 @@ def _without_losses(roadmap: Roadmap, configurations: Tensor, tolerances: Tolera
     while True:
         edges = roadmap.edges[stale]
         connected[stale] = continuous_edges(
-            robot, task, points, configurations, resolved, edges, tolerances, progress
+            robot, task, points, configurations, resolved, edges, tolerances, progress, check
         ).cpu()
         lost = roadmap.edges[roadmap.connected & ~connected].unique()
         if len(lost) == 0:
