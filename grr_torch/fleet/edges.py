@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -22,8 +23,6 @@ from grr_torch.spaces.task import TaskSpace
 
 # fewer edges than this are not worth the way to a worker
 _LEAST = 512
-# pieces a worker, so that none waits long for the slowest
-_PIECES = 2
 _RETRIES = 3
 
 
@@ -65,9 +64,11 @@ class SpreadCheck:
             return is_continuous(robot, task, *ends, tolerances=tolerances)
         if robot is not self._robot:
             self._robot, self._sent = robot, self._ray.put(robot)
-        pieces = min(self._workers * _PIECES, -(-count // _LEAST))
+        pieces = min(self._workers, -(-count // _LEAST))
         parts = zip(*(end.tensor_split(pieces) for end in ends), strict=True)
-        waiting = [self._task.remote(self._sent, task, [part.numpy() for part in piece], tolerances) for piece in parts]
+        waiting = [
+            self._task.remote([self._sent], task, [part.numpy() for part in piece], tolerances) for piece in parts
+        ]
         try:
             found = self._ray.get(waiting)
         except self._ray.exceptions.RayError as error:
@@ -82,6 +83,15 @@ def spread_check(address: str | None = None) -> Iterator[SpreadCheck]:
         yield SpreadCheck(ray)
 
 
-def _check(robot: Robot, task: TaskSpace, ends: list[Any], tolerances: Tolerances) -> Any:
+def _check(sent: list[Any], task: TaskSpace, ends: list[Any], tolerances: Tolerances) -> Any:
     """One piece, on a worker."""
+    robot = _robot(sent[0])
     return is_continuous(robot, task, *(torch.as_tensor(end.copy()) for end in ends), tolerances=tolerances).numpy()
+
+
+@lru_cache(maxsize=1)
+def _robot(reference: Any) -> Robot:
+    """The robot, fetched once a worker: its tables are made when it is first used."""
+    import ray
+
+    return ray.get(reference)
