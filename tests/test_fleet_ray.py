@@ -156,15 +156,21 @@ def test_a_build_whose_edges_are_checked_by_workers_gives_equal_tensors(ray, pla
         torch.testing.assert_close(getattr(spread, name), getattr(alone, name), rtol=0, atol=0, equal_nan=True)
 
 
-def test_workers_judge_edges_as_this_process_does(ray, planar_5, generator, monkeypatch):
+def test_workers_judge_edges_as_this_process_does_even_if_one_is_killed(ray, planar_5, generator, monkeypatch):
     monkeypatch.setattr(edges, "_LEAST", 16)
     task = grr_torch.Position(2)
     q = [planar_5.sample(301, generator)]
     q.append(q[0] + torch.linspace(0.0, 1.0, 301, dtype=torch.float64)[:, None])
     p = [planar_5.forward_kinematics(part)[0][..., :2] for part in q]
-    found = edges.SpreadCheck(ray)(planar_5, task, *p, *q)
-    assert torch.equal(found, grr_torch.is_continuous(planar_5, task, *p, *q))
-    assert 0 < int(found.sum()) < len(found)
+    check = edges.SpreadCheck(ray)
+    expected = grr_torch.is_continuous(planar_5, task, *p, *q)
+    assert torch.equal(check(planar_5, task, *p, *q), expected)
+    assert 0 < int(expected.sum()) < len(expected)
+    others = psutil.Process(os.getpid()).children(recursive=True)
+    workers = [other for other in others if other.name().startswith("ray::_Worker")]
+    assert workers
+    workers[0].kill()
+    assert torch.equal(check(planar_5, task, *p, *q), expected)
 
 
 def test_a_cluster_that_answers_is_joined(ray, tmp_path):

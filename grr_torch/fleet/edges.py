@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from typing import Any
 
 import torch
@@ -23,23 +22,29 @@ from grr_torch.spaces.task import TaskSpace
 
 # fewer edges than this are not worth the way to a worker
 _LEAST = 512
+# how often a worker that is lost is replaced
 _RETRIES = 3
 
 
 class SpreadCheck:
-    """`is_continuous` by the workers of a cluster. A piece whose worker is lost is checked again."""
+    """`is_continuous` by the workers of a cluster. A piece whose worker is lost is checked again.
+
+    Attributes:
+        at_once: How many edges it is best asked for together: each time, the slowest worker is waited for.
+    """
+
+    at_once = 1 << 17
 
     def __init__(self, ray: Any) -> None:
-        """A check.
+        """A check, with a worker for each core of the cluster that is free.
 
         Args:
             ray: Ray, connected, as `cluster` gives it.
         """
         self._ray = ray
-        self._task = ray.remote(num_cpus=1, max_retries=_RETRIES)(_check)
-        self._workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
+        self._count = max(1, int(ray.available_resources().get("CPU", 1)))
         self._robot: Robot | None = None
-        self._sent: Any = None
+        self._workers: list[Any] = []
 
     def __call__(
         self,
@@ -63,11 +68,15 @@ class SpreadCheck:
         if count < _LEAST:
             return is_continuous(robot, task, *ends, tolerances=tolerances)
         if robot is not self._robot:
-            self._robot, self._sent = robot, self._ray.put(robot)
-        pieces = min(self._workers, -(-count // _LEAST))
+            worker = self._ray.remote(num_cpus=1, max_restarts=_RETRIES, max_task_retries=_RETRIES)(_Worker)
+            sent = self._ray.put(robot)
+            self._robot, self._workers = robot, []  # those of another robot end, and free their cores
+            self._workers = [worker.remote(sent) for _ in range(self._count)]
+        pieces = min(self._count, -(-count // _LEAST))
         parts = zip(*(end.tensor_split(pieces) for end in ends), strict=True)
         waiting = [
-            self._task.remote([self._sent], task, [part.numpy() for part in piece], tolerances) for piece in parts
+            worker.check.remote(task, [part.numpy() for part in piece], tolerances)
+            for worker, piece in zip(self._workers, parts, strict=False)
         ]
         try:
             found = self._ray.get(waiting)
@@ -83,15 +92,13 @@ def spread_check(address: str | None = None) -> Iterator[SpreadCheck]:
         yield SpreadCheck(ray)
 
 
-def _check(sent: list[Any], task: TaskSpace, ends: list[Any], tolerances: Tolerances) -> Any:
-    """One piece, on a worker."""
-    robot = _robot(sent[0])
-    return is_continuous(robot, task, *(torch.as_tensor(end.copy()) for end in ends), tolerances=tolerances).numpy()
+class _Worker:
+    """Keeps the robot, whose tables are made when it is first used."""
 
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
 
-@lru_cache(maxsize=1)
-def _robot(reference: Any) -> Robot:
-    """The robot, fetched once a worker: its tables are made when it is first used."""
-    import ray
-
-    return ray.get(reference)
+    def check(self, task: TaskSpace, ends: list[Any], tolerances: Tolerances) -> Any:
+        """One piece."""
+        tensors = [torch.as_tensor(end.copy()) for end in ends]
+        return is_continuous(self.robot, task, *tensors, tolerances=tolerances).numpy()

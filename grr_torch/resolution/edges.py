@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # edges that are checked together
 _AT_ONCE = 16384
 
-# `is_continuous`, or what gives the same by other means
+# `is_continuous`, or what gives the same by other means, and may say by `at_once` how many edges it takes together
 EdgeCheck = Callable[..., Tensor]
 
 
@@ -59,9 +59,10 @@ def continuous_edges(
     points = points.to(configurations)
     connected = torch.zeros(len(edges), dtype=torch.bool, device=robot.device)
     candidates = resolved[edges].all(1).nonzero()[:, 0]
-    for start in range(0, len(candidates), _AT_ONCE):
+    at_once = getattr(check, "at_once", _AT_ONCE)
+    for start in range(0, len(candidates), at_once):
         progress("checking edges", start, len(candidates))
-        part = candidates[start : start + _AT_ONCE]
+        part = candidates[start : start + at_once]
         a, b = edges[part].T
         ends = points[a], points[b], configurations[a], configurations[b]
         connected[part] = check(robot, task, *ends, tolerances=tolerances)
