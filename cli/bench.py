@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.bench_cluster import cluster
 from grr_torch.cli.bench_learning import learning
 from grr_torch.cli.bench_rotations import rotations
 from grr_torch.cli.bench_scale import scale
@@ -25,6 +26,7 @@ app.command()(teleop)
 app.command()(learning)
 app.command()(rotations)
 app.command()(scale)
+app.command()(cluster)
 
 
 @app.callback()

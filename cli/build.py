@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from grr_torch.cli.show import print_json, print_rows, progress_bar, quality_rows, reports_errors
+from grr_torch.cli.show import ENGINES, print_json, print_rows, progress_bar, quality_rows, reports_errors
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import ParameterError, UnknownNameError
 
 
 @reports_errors
@@ -91,6 +91,12 @@ def build(
         bool, typer.Option("--resume", help="Go on from what --checkpoint holds; an absent or empty one starts afresh.")
     ] = False,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
+    engine: Annotated[
+        str, typer.Option(help="local; ray: the continuity checks are spread over the workers of a Ray cluster.")
+    ] = "local",
+    address: Annotated[
+        str | None, typer.Option(help="host:port of a Ray cluster, or auto; by default one is started here.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
 ) -> None:
     """Build a roadmap, print its quality, and write it with a recording of it.
@@ -108,7 +114,7 @@ def build(
     from grr_torch.resolution.report import summary, traded
     from grr_torch.robots.load import load_robot
 
-    with progress_bar() as progress:
+    with progress_bar() as progress, _edge_check(engine, address, device) as check:
         progress("loading the robot", 0, 1)
         arm = load_robot(
             robot,
@@ -147,6 +153,7 @@ def build(
             seed=seed,
             checkpoint=checkpoint,
             resume=resume,
+            check=check,
             progress=progress,
         )
         figures = roadmap.quality(progress)
@@ -178,6 +185,26 @@ def build(
         ("written", written),
     ]
     print_rows(title, [*quality_rows(quality), *rows])
+
+
+@contextmanager
+def _edge_check(engine: str, address: str | None, device: str) -> Iterator[Any]:
+    """What checks edges, for as long as it is needed."""
+    from grr_torch.projection.continuity import is_continuous
+
+    if engine not in ENGINES:
+        raise UnknownNameError("engine", engine, ENGINES)
+    if engine == "local":
+        if address is not None:
+            raise ParameterError("--address", address, "none without --engine ray")
+        yield is_continuous
+        return
+    from grr_torch.fleet.edges import spread_check
+
+    if device != "cpu":
+        raise ParameterError("--device", device, "cpu with --engine ray, whose workers check on their cores")
+    with spread_check(address) as check:
+        yield check
 
 
 def _seeds(arm: Any, seeds: str | None) -> Any:

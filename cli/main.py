@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from grr_torch.cli.bench import app as bench
 from grr_torch.cli.build import build
+from grr_torch.cli.catalogue import catalogue
 from grr_torch.cli.eval_ik import eval_ik
 from grr_torch.cli.export import export
 from grr_torch.cli.export_ik import export_ik
@@ -18,6 +19,7 @@ from grr_torch.cli.robots import robots
 from grr_torch.cli.smm import smm
 from grr_torch.cli.solve import solve
 from grr_torch.cli.spheres import spheres
+from grr_torch.cli.sweep import sweep
 from grr_torch.cli.teleop import teleop
 from grr_torch.cli.train_ik import train_ik
 from grr_torch.cli.view import view
@@ -33,7 +35,23 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-for command in (robots, build, info, view, solve, plan, teleop, smm, spheres, export, train_ik, export_ik, eval_ik):
+for command in (
+    robots,
+    build,
+    info,
+    view,
+    solve,
+    plan,
+    teleop,
+    smm,
+    spheres,
+    export,
+    train_ik,
+    export_ik,
+    eval_ik,
+    sweep,
+    catalogue,
+):
     app.command()(command)
 app.add_typer(bench)
 

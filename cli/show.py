@@ -18,6 +18,9 @@ from grr_torch.progress import Progress
 P = ParamSpec("P")
 R = TypeVar("R")
 
+# where builds run
+ENGINES = ("local", "ray")
+
 
 def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
     """Turns bad input into one line on standard error and exit code 2, Ctrl-C into exit code 130."""

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError, UnknownNameError, check_seed
 from grr_torch.progress import Progress, silent
+from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
 from grr_torch.resolution.auto_seeds import CANDIDATES, find_seeds
 from grr_torch.resolution.checkpoint import Checkpoint, digest
-from grr_torch.resolution.edges import continuous_edges
+from grr_torch.resolution.edges import EdgeCheck, continuous_edges
 from grr_torch.resolution.expand import default_neighbours, expand
 from grr_torch.resolution.memory import require_memory
 from grr_torch.resolution.objectives import check_objectives
@@ -54,6 +55,7 @@ def build(
     tolerances: Tolerances = DEFAULT_TOLERANCES,
     checkpoint: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    check: EdgeCheck = is_continuous,
     progress: Progress = silent,
 ) -> Roadmap:
     """Builds a roadmap with Expansion-GRR, or with the baseline Random-GRR, and refines it.
@@ -84,6 +86,7 @@ def build(
             on; the finished roadmap stays in it.
         resume: Whether to go on from what `checkpoint` holds, if it holds anything. The tensors come out as if the
             build had not been interrupted.
+        check: What checks batches of edges: `is_continuous`, or a `grr_torch.fleet.edges.SpreadCheck` on a cluster.
         progress: Told what is being done and how far it is.
 
     Returns:
@@ -121,12 +124,14 @@ def build(
             parts = _at_random(robot, problem, samples, seed, tolerances, progress, kept)
         else:
             problem = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
-            parts = _expanded(robot, problem, neighbours, tolerances, progress, kept)
+            parts = _expanded(robot, problem, neighbours, tolerances, check, progress, kept)
     settings = {"margin": robot.margin, "seed": seed, "reachability": reachability, "tolerances": asdict(tolerances)}
     parameters = {"method": method, **parts.chosen, **settings}
     roadmap = _assemble(robot, problem, parts, parameters, kept.seconds("building"))
     if refine:
-        roadmap = refine_roadmap(roadmap, objectives=objectives, seed=seed, progress=progress, checkpoint=kept)
+        roadmap = refine_roadmap(
+            roadmap, objectives=objectives, seed=seed, check=check, progress=progress, checkpoint=kept
+        )
     if reachability:
         roadmap = _with_reachability(roadmap, tolerances, progress, kept)
     if kept.folder is not None:
@@ -243,6 +248,7 @@ def _expanded(
     problem: Problem,
     neighbours: int | None,
     tolerances: Tolerances,
+    check: EdgeCheck,
     progress: Progress,
     kept: Checkpoint,
 ) -> _Parts:
@@ -260,7 +266,7 @@ def _expanded(
     )
     found = expansion.configurations, expansion.resolved
     stage = kept.stage("edges")
-    connected = continuous_edges(robot, task, graph.points, *found, graph.edges, tolerances, progress, stage)
+    connected = continuous_edges(robot, task, graph.points, *found, graph.edges, tolerances, progress, stage, check)
     chosen = {
         "neighbours": default_neighbours(task) if neighbours is None else neighbours,
         "seeds": torch.as_tensor(table, dtype=torch.float64).tolist(),

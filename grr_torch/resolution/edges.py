@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 # edges that are checked together
 _AT_ONCE = 16384
 
+# `is_continuous`, or what gives the same by other means, and may say by `at_once` how many edges it takes together
+EdgeCheck = Callable[..., Tensor]
+
 
 def check_edges(roadmap: Roadmap, tolerances: Tolerances, progress: Progress = silent, kept: Stage = UNKEPT) -> Tensor:
     """Which edges of a roadmap are continuous, checked anew: (E,) bool."""
@@ -37,6 +41,7 @@ def continuous_edges(
     tolerances: Tolerances,
     progress: Progress,
     kept: Stage = UNKEPT,
+    check: EdgeCheck = is_continuous,
 ) -> Tensor:
     """Which edges between resolved vertices are continuous: (E,) bool, on the robot's device.
 
@@ -50,6 +55,7 @@ def continuous_edges(
         tolerances: Of the projections.
         progress: Told how many edges are checked.
         kept: Where it is kept how far that is.
+        check: What checks a batch of edges.
     """
     configurations, resolved, edges = (part.to(robot.device) for part in (configurations, resolved, edges))
     configurations = configurations.to(robot.dtype)
@@ -59,12 +65,13 @@ def continuous_edges(
     state = kept.state()
     if state:
         connected = state["connected"].to(robot.device)
-    for start in range(int(state["done"]) if state else 0, len(candidates), _AT_ONCE):
+    at_once = getattr(check, "at_once", _AT_ONCE)
+    for start in range(int(state["done"]) if state else 0, len(candidates), at_once):
         progress("checking edges", start, len(candidates))
-        part = candidates[start : start + _AT_ONCE]
+        part = candidates[start : start + at_once]
         a, b = edges[part].T
         ends = points[a], points[b], configurations[a], configurations[b]
-        connected[part] = is_continuous(robot, task, *ends, tolerances=tolerances)
+        connected[part] = check(robot, task, *ends, tolerances=tolerances)
         end = start + len(part)
         kept.keep({"connected": connected, "done": torch.tensor(end)}, last=end == len(candidates))
     progress("checking edges", len(candidates), len(candidates))

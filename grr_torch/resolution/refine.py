@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from grr_torch.progress import Progress, silent
+from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.certify import certify
 from grr_torch.resolution.checkpoint import UNKEPT, Checkpoint, Stage
-from grr_torch.resolution.edges import continuous_edges
+from grr_torch.resolution.edges import EdgeCheck, continuous_edges
 from grr_torch.resolution.objectives import Objective, check_objectives, measure_objective
 from grr_torch.resolution.quality import edge_slopes
 from grr_torch.resolution.relax import Network, relax
@@ -29,6 +30,7 @@ def refine(
     *,
     objectives: Mapping[str, float] | None = None,
     seed: int = 0,
+    check: EdgeCheck = is_continuous,
     progress: Progress = silent,
     checkpoint: Checkpoint | None = None,
 ) -> Roadmap:
@@ -43,6 +45,7 @@ def refine(
         roadmap: The roadmap.
         objectives: Weights of "clearance", "manipulability" and "limits"; one with weight 0 is only reported.
         seed: Of the random starts.
+        check: What checks batches of edges.
         progress: Told what is being done and how far it is.
         checkpoint: Where it is kept what is done; nowhere by default.
 
@@ -60,9 +63,9 @@ def refine(
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
     with checkpoint.timed("refinement"):
         repaired = repair(roadmap, tolerances, seed, progress, checkpoint.stage("repair"))
-        smoothest = _relaxed(repaired, {}, tolerances, progress, checkpoint)
+        smoothest = _relaxed(repaired, {}, tolerances, check, progress, checkpoint)
         wanted = {name: weight for name, weight in weights.items() if weight > 0.0}
-        refined = _relaxed(smoothest, wanted, tolerances, progress, checkpoint) if wanted else smoothest
+        refined = _relaxed(smoothest, wanted, tolerances, check, progress, checkpoint) if wanted else smoothest
     seconds = told["seconds"] = checkpoint.seconds("refinement")
     if weights:
         slopes = edge_slopes(smoothest)
@@ -88,7 +91,12 @@ def _figures(roadmap: Roadmap, objective: str) -> dict[str, float | None]:
 
 
 def _relaxed(
-    roadmap: Roadmap, weights: Mapping[str, float], tolerances: Tolerances, progress: Progress, checkpoint: Checkpoint
+    roadmap: Roadmap,
+    weights: Mapping[str, float],
+    tolerances: Tolerances,
+    check: EdgeCheck,
+    progress: Progress,
+    checkpoint: Checkpoint,
 ) -> Roadmap:
     """The relaxed and certified map, but for the surroundings of edges that it would break."""
     edges = roadmap.edges[roadmap.connected]
@@ -103,7 +111,7 @@ def _relaxed(
     new = certify(network, cells, new, tolerances, progress, checkpoint).T
     configurations = roadmap.configurations.clone()
     configurations[vertices] = new.cpu()
-    return _without_losses(roadmap, configurations, tolerances, progress, checkpoint.stage("edges-again"))
+    return _without_losses(roadmap, configurations, tolerances, check, progress, checkpoint.stage("edges-again"))
 
 
 def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping[str, float]) -> Network:
@@ -121,7 +129,12 @@ def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping
 
 
 def _without_losses(
-    roadmap: Roadmap, configurations: Tensor, tolerances: Tolerances, progress: Progress, kept: Stage
+    roadmap: Roadmap,
+    configurations: Tensor,
+    tolerances: Tolerances,
+    check: EdgeCheck,
+    progress: Progress,
+    kept: Stage,
 ) -> Roadmap:
     """The roadmap with new configurations, but with its own round edges that would be lost."""
     connected = torch.zeros_like(roadmap.connected)
@@ -131,7 +144,7 @@ def _without_losses(
     while True:
         edges = roadmap.edges[stale]
         connected[stale] = continuous_edges(
-            robot, task, points, configurations, resolved, edges, tolerances, progress, kept
+            robot, task, points, configurations, resolved, edges, tolerances, progress, kept, check
         ).cpu()
         kept = UNKEPT  # the first time takes nearly all of it
         lost = roadmap.edges[roadmap.connected & ~connected].unique()
