@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -120,6 +122,7 @@ def test_the_driver_killed_and_started_again_does_only_the_rest(tmp_path):
             assert process.poll() is None
             time.sleep(0.02)
         others = psutil.Process(process.pid).children(recursive=True)
+        used = {part for other in others for word in other.cmdline() for part in re.findall(r"/tmp/grr-ray-\w+", word)}
     finally:
         process.kill()
     process.wait()
@@ -130,6 +133,8 @@ def test_the_driver_killed_and_started_again_does_only_the_rest(tmp_path):
     for other in others:
         if other.is_running():
             other.kill()
+    for folder_of_ray in used:
+        shutil.rmtree(folder_of_ray, ignore_errors=True)
     assert not alive
     orders = read_sweep(tmp_path / "s.yaml")
     before = stamps(folder)

@@ -71,7 +71,7 @@ def read_catalogue(folder: Path) -> list[Row]:
     if not folder.is_dir():
         raise FileFormatError(folder, "is not a folder")
     rows: list[Row] = []
-    for path in sorted(folder.glob("*.grr")):
+    for path in sorted(folder.glob("[!.]*.grr")):
         try:
             row = _done(path)
         except FileFormatError as error:
@@ -80,7 +80,7 @@ def read_catalogue(folder: Path) -> list[Row]:
         if row is not None:
             rows.append(row)
     done = {row["hash"] for row in rows}
-    failed = [_failed(path) for path in sorted(folder.glob(f"*{_FAILED}"))]
+    failed = [_failed(path) for path in sorted(folder.glob(f"[!.]*{_FAILED}"))]
     return rows + [row for row in failed if row is not None and row["hash"] not in done]
 
 
