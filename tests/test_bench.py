@@ -14,7 +14,8 @@ from grr_torch.experiments import peers
 from grr_torch.experiments.profile import profile_build
 from grr_torch.experiments.projection_cost import count_operators, projection_cost
 from grr_torch.experiments.speed import SECTIONS, measure_speed
-from grr_torch.experiments.timing import in_fresh_process, median_seconds, peak_memory
+from grr_torch.experiments.timing import in_fresh_process, median_seconds
+from grr_torch.resolution.memory import peak_memory
 
 
 def test_a_section_gives_rows_with_figures():

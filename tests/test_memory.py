@@ -53,7 +53,7 @@ def test_the_share_that_can_be_resolved_is_about_right(kinova):
 
 
 def peak_of_a_build(points):
-    from grr_torch.experiments.timing import peak_memory
+    from grr_torch.resolution.memory import peak_memory
 
     robot = grr_torch.load_robot("kinova")
     grr_torch.build(robot, "position", points=1_000)

@@ -92,10 +92,13 @@ class Teleoperator:
             timeout: An input older than this [s] is refused; see `step`.
 
         Raises:
-            ParameterError: A parameter is out of its range, no vertex is resolved, or rotation varies in the task.
+            ParameterError: A parameter is out of its range, no vertex is resolved, the robot is not on the CPU, or
+                rotation varies in the task.
         """
         robot = roadmap.robot
         check_teleoperable(roadmap.task)
+        if robot.device.type != "cpu":
+            raise ParameterError("device of the robot", str(robot.device), "cpu, where few arms are fastest")
         if not 0.0 < rate < math.inf:
             raise ParameterError("rate", rate, "above 0, in Hz")
         for name, value in (("max_jump", max_jump), ("timeout", timeout)):

@@ -129,7 +129,7 @@ def _timed(roadmap: Roadmap, check: EdgeCheck, expected: torch.Tensor) -> float:
     """
     begin = time.perf_counter()
     parts = (roadmap.robot, roadmap.task, roadmap.points, roadmap.configurations, roadmap.resolved, roadmap.edges)
-    found = continuous_edges(*parts, Tolerances(**roadmap.parameters["tolerances"]), silent, check)
+    found = continuous_edges(*parts, Tolerances(**roadmap.parameters["tolerances"]), silent, check=check)
     seconds = time.perf_counter() - begin
     if not torch.equal(found, expected):
         raise GrrError(f"{int((found != expected).sum())} edges were judged otherwise")

@@ -6,7 +6,6 @@ import gc
 import multiprocessing
 import os
 import platform
-import resource
 import statistics
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from typing import Any
 
 import torch
 
+from grr_torch.resolution.memory import peak_memory
 from grr_torch.version import __version__
 
 # shorter calls are repeated until so much time has passed [s]
@@ -73,17 +73,6 @@ def in_fresh_process(function: Callable[..., Any], *arguments: Any) -> tuple[Any
 def _with_memory(function: Callable[..., Any], threads: int, arguments: tuple[Any, ...]) -> tuple[Any, float]:
     torch.set_num_threads(threads)
     return function(*arguments), peak_memory()
-
-
-def peak_memory() -> float:
-    """The most memory that this process has held [MiB]."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        # ru_maxrss may be that of the process that started this one
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-        return float(line.split()[1]) / 2**10
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def machine() -> dict[str, str]:

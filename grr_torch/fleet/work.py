@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +12,7 @@ from grr_torch.fleet.options import known_options, of_owner
 from grr_torch.fleet.order import Order, make_order_task
 from grr_torch.progress import Progress, silent
 from grr_torch.resolution.build import build
+from grr_torch.resolution.memory import forget_peak, peak_memory
 from grr_torch.robots.load import load_robot
 
 # makes an order's roadmap file in a folder
@@ -34,14 +33,14 @@ def make_roadmap(order: Order, folder: Path, progress: Progress = silent) -> Non
         GrrError: It cannot be built or written.
     """
     begin = time.perf_counter()
-    _forget_peak()
+    forget_peak()
     robot = load_robot(**of_owner("robot", order.options))
     said = {name: value for name, value in of_owner("build", order.options).items() if name != "task"}
     roadmap = build(robot, make_order_task(robot, order.options), **said, progress=progress)
     told = describe(order)
     roadmap = replace(roadmap, parameters={**roadmap.parameters, "fleet": told})
     roadmap.quality(progress)  # is part of the cost
-    told |= {"seconds": time.perf_counter() - begin, "peak_memory_mib": _peak()}
+    told |= {"seconds": time.perf_counter() - begin, "peak_memory_mib": peak_memory()}
     roadmap.save(order.path(folder))
 
 
@@ -55,22 +54,3 @@ def describe(order: Order) -> dict[str, Any]:
         "orientation": order.orientation,
         "parameters": {name: list(value) if isinstance(value, tuple) else value for name, value in parameters.items()},
     }
-
-
-def _forget_peak() -> None:
-    """Lets the system measure this process's peak anew, where it can (Linux)."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return
-
-
-def _peak() -> float:
-    """The most memory that this process has held, since it was last forgotten where that can be done [MiB]."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        line = next((line for line in status.read_text().splitlines() if line.startswith("VmHWM")), None)
-        if line is not None:
-            return float(line.split()[1]) / 2**10
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)

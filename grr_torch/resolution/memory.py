@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+import sys
 from pathlib import Path
 
 import torch
@@ -129,3 +131,23 @@ def _lines(path: Path) -> list[str]:
 
 def _gibibytes(size: float) -> str:
     return f"{size / 2**30:.1f} GiB"
+
+
+def forget_peak() -> None:
+    """Lets the system measure this process's peak anew, where it can (Linux)."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return
+
+
+def peak_memory() -> float:
+    """The most memory that this process has held [MiB], since it was last forgotten where that can be done."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        # ru_maxrss may be that of the process that started this one
+        line = next((line for line in status.read_text().splitlines() if line.startswith("VmHWM")), None)
+        if line is not None:
+            return float(line.split()[1]) / 2**10
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)
