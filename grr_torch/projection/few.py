@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from grr_torch.projection.project import Tolerances
 
 
+# errors of a hostile guess may be beyond all numbers: they do not converge
+@np.errstate(over="ignore", invalid="ignore")
 def converge_few(
     robot: Robot, task: TaskSpace, tolerances: Tolerances, limits: Limits | None, targets: Tensor, q: Tensor
 ) -> tuple[Tensor, Tensor]:
