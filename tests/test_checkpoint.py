@@ -100,7 +100,7 @@ def test_killed_at_random_times_it_ends_with_the_same_tensors(planar_5, tmp_path
     folder, out = tmp_path / "c", tmp_path / "map.grr"
     times, kills = random.Random(), 0
     for attempt in range(40):
-        process = subprocess.Popen([sys.executable, "-c", KILLED, folder, out], stdout=subprocess.PIPE)
+        process = subprocess.Popen([sys.executable, "-P", "-c", KILLED, folder, out], stdout=subprocess.PIPE)
         process.stdout.readline()
         if attempt < 3:
             time.sleep(times.uniform(0.0, 1.0))

@@ -14,7 +14,7 @@ from grr_torch.cli.main import join_bounds
 
 import grr_torch
 
-PROGRAM = [sys.executable, "-m", "grr_torch.cli.main"]
+PROGRAM = [sys.executable, "-P", "-m", "grr_torch.cli.main"]
 QUALITY = {
     "vertices",
     "edges",
@@ -255,7 +255,9 @@ def test_help_has_an_example(tmp_path, command):
 def test_help_imports_nothing_heavy(tmp_path):
     heavy = ("torch", "numpy", "rerun", "trimesh", "viser")
     code = f"import sys, grr_torch.cli.main; print([m for m in {heavy} if m in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert result.stdout.strip() == "[]"
 
 

@@ -114,7 +114,7 @@ def test_what_always_fails_is_reported_and_the_rest_goes_on(ray, tmp_path, marks
 
 def test_the_driver_killed_and_started_again_does_only_the_rest(tmp_path):
     (tmp_path / "s.yaml").write_text(SMALL + f"grid: {{seed: {list(range(80))}}}")
-    words = [sys.executable, "-m", "grr_torch.cli.main", "sweep", "s.yaml", "--engine", "ray", "--out", "out"]
+    words = [sys.executable, "-P", "-m", "grr_torch.cli.main", "sweep", "s.yaml", "--engine", "ray", "--out", "out"]
     process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     folder = tmp_path / "out"
     try:
@@ -181,7 +181,18 @@ def test_workers_judge_edges_as_this_process_does_even_if_one_is_killed(ray, pla
 def test_a_cluster_that_answers_is_joined(ray, tmp_path):
     (tmp_path / "s.yaml").write_text(SMALL + "grid: {seed: [0, 1]}")
     address = ray.get_runtime_context().gcs_address
-    words = [sys.executable, "-m", "grr_torch.cli.main", "sweep", "s.yaml", "--engine", "ray", "--address", address]
+    words = [
+        sys.executable,
+        "-P",
+        "-m",
+        "grr_torch.cli.main",
+        "sweep",
+        "s.yaml",
+        "--engine",
+        "ray",
+        "--address",
+        address,
+    ]
     result = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert "2 of 2 roadmaps, 2 of them built now" in result.stdout

@@ -79,7 +79,7 @@ def test_help_has_an_example(command):
 def test_ctrl_c_ends_with_130_and_the_next_run_goes_on(tmp_path):
     (tmp_path / "s.yaml").write_text(SMALL + f"grid: {{seed: {list(range(3000))}}}")
     process = subprocess.Popen(
-        [sys.executable, "-m", "grr_torch.cli.main", "sweep", "s.yaml", "--out", "out"],
+        [sys.executable, "-P", "-m", "grr_torch.cli.main", "sweep", "s.yaml", "--out", "out"],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -117,7 +117,7 @@ def test_a_live_session_ends_cleanly_and_leaves_its_files(file, tmp_path, number
     pytest.importorskip("viser", reason="viser is not installed")
     words = ["teleop", file, "--port", "0", "--record", "live.rrd", "--out", "live.csv"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "grr_torch.cli.main", *map(str, words)],
+        [sys.executable, "-P", "-m", "grr_torch.cli.main", *map(str, words)],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -223,7 +223,7 @@ def _process_seconds(path: Path, repeats: int) -> float:
     point = [str(value) for value in _some_point(Roadmap.load(path))[0].tolist()]
     seconds = median_process_seconds(
         {
-            "solve": ["-m", "grr_torch.cli.main", "solve", str(path), "--point", *point],
+            "solve": ["-P", "-m", "grr_torch.cli.main", "solve", str(path), "--point", *point],
             "torch": ["-c", "import torch"],
         },
         repeats,

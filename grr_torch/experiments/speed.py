@@ -199,7 +199,7 @@ def _builds(bench: _Bench) -> Iterator[Row]:
 def _processes(bench: _Bench) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as folder:
         out = str(Path(folder) / "kinova.grr")
-        command = ["-m", "grr_torch.cli.main"]
+        command = ["-P", "-m", "grr_torch.cli.main"]
         seconds = median_process_seconds(
             {
                 "build": [*command, "build", "--robot", "kinova", "--out", out, "--device", str(bench.robot.device)],
