@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import re
@@ -35,8 +36,15 @@ if importlib.util.find_spec("ray") is None:  # not imported: clusters that are s
     pytest.skip("ray is not installed (extra cluster)", allow_module_level=True)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def elsewhere(tmp_path_factory):
+    """Ray's workers import from the working directory, in which the sources lie without their commands."""
+    with contextlib.chdir(tmp_path_factory.mktemp("elsewhere")):
+        yield
+
+
 @pytest.fixture(scope="module")
-def ray():
+def ray(elsewhere):
     with cluster_module.cluster(cpus=2) as connected:
         yield connected
 
