@@ -136,26 +136,32 @@ def build(
             if recording.resolve() == out.resolve():
                 raise ParameterError("--record", recording, f"another file than the roadmap's, {out}")
         box = None if bounds is None else _bounds(bounds)
-        roadmap = build_roadmap(
-            arm,
-            _task(arm, task, box, rotation, axis),
-            points=points,
-            bounds=box,
-            seeds=_seeds(arm, seeds),
-            rotations=rotations,
-            candidates=CANDIDATES if candidates is None else candidates,
-            method=method,
-            samples=samples,
-            neighbours=neighbours,
-            refine=refine,
-            objectives=_weights(objective or []),
-            reachability=reachability,
-            seed=seed,
-            checkpoint=checkpoint,
-            resume=resume,
-            check=check,
-            progress=progress,
-        )
+        try:
+            roadmap = build_roadmap(
+                arm,
+                _task(arm, task, box, rotation, axis),
+                points=points,
+                bounds=box,
+                seeds=_seeds(arm, seeds),
+                rotations=rotations,
+                candidates=CANDIDATES if candidates is None else candidates,
+                method=method,
+                samples=samples,
+                neighbours=neighbours,
+                refine=refine,
+                objectives=_weights(objective or []),
+                reachability=reachability,
+                seed=seed,
+                checkpoint=checkpoint,
+                resume=resume,
+                check=check,
+                progress=progress,
+            )
+        except KeyboardInterrupt:
+            if checkpoint is None:
+                raise
+            typer.echo(f"interrupted: what is done is in {checkpoint}; --resume goes on from there", err=True)
+            raise typer.Exit(130) from None
         figures = roadmap.quality(progress)
         progress("writing", 0, 2)
         # both files appear together, or neither does

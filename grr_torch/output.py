@@ -10,6 +10,9 @@ from pathlib import Path
 
 from grr_torch.errors import OutputError
 
+# files that were not finished
+PARTIAL = ".*.partial.*"
+
 
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Finds out before the work starts whether `path` could be written.

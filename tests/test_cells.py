@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import grr_torch
 from grr_torch.resolution.quality import edge_slopes, steep_edges
-from grr_torch.spaces.cliques import triangles
+from grr_torch.spaces.cliques import draw, triangles
 from grr_torch.spaces.graph import TaskGraph, find_lattice, staggered_grid
 
 
@@ -138,3 +138,11 @@ def test_cells_of_nothing(planar_5):
 @pytest.fixture(scope="module")
 def planar_roadmap():
     return grr_torch.build(grr_torch.load_robot("planar_5"), "position", points=300)
+
+
+@pytest.mark.parametrize(("count", "most"), [(10, 20), (30, 20), (300, 20)])
+def test_as_many_cells_are_drawn_as_were_asked_for_none_twice(count, most):
+    drawn = draw(count, most)
+    assert len(drawn) == len(drawn.unique()) == min(count, most)
+    assert bool((drawn.diff() > 0).all())
+    assert 0 <= int(drawn[0]) <= int(drawn[-1]) < count

@@ -237,3 +237,21 @@ def test_targets_of_another_shape_are_refused(roadmap, target):
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[_vertices(roadmap, 1)[0]])
     with pytest.raises(ParameterError, match="target"):
         teleoperator.step(target)
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["built", "loaded"])
+def test_a_robot_in_single_precision_is_solved_for_and_teleoperated(tmp_path, again):
+    roadmap = grr_torch.build(
+        grr_torch.load_robot("planar_5", dtype=torch.float32), "position", points=200, refine=False
+    )
+    if again:
+        roadmap.save(tmp_path / "single.grr")
+        roadmap = grr_torch.Roadmap.load(tmp_path / "single.grr")
+    points = roadmap.points[roadmap.resolved]
+    solution = roadmap.solve(points)
+    assert solution.configurations.dtype == torch.float32
+    assert bool(solution.valid.all())
+    arm = Teleoperator(roadmap)
+    for target in (points[0], points[1], points[1] * 3.0, points[2]):
+        for _ in range(5):
+            assert bool(arm.step(target).configuration.isfinite().all())

@@ -57,7 +57,8 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     tried = (left < left[:, :1]) | ~known[:, None]
     tried[:, [0, -1]] = True
     flat = points[tried]
-    guesses, codes = solver.guess(flat)
+    guesses, codes = solver.guess(flat.to(torch.float64))
+    guesses = guesses.to(flat)
     columns, codes = solver.solve_from(
         flat.T.contiguous(), guesses, codes, replace(solver.tolerances, iterations=_ITERATIONS)
     )

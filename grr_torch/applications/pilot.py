@@ -69,6 +69,7 @@ class Arms:
         last_goal: (B, width) the goal it belongs to; NaN where there is none.
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
         blind: (B,) steps for which an arm on a route follows it before it looks for a straight way to its target again.
+        aimed: (B, width) the target for which it does so; a target elsewhere is looked for at once.
         doubt: (B,) how many these are the next time.
         offsets: (B, n) what the last end of a line differed from its guess by.
     """
@@ -83,6 +84,7 @@ class Arms:
     last_goal: Tensor
     next_vertex: Tensor
     blind: Tensor
+    aimed: Tensor
     doubt: Tensor
     offsets: Tensor
 
@@ -92,7 +94,8 @@ class Arms:
         nothing = q.new_full((len(q), follower.task.width), torch.nan)
         off, no_vertex = torch.zeros(len(q), dtype=torch.bool), torch.full((len(q),), -1)
         held, last_goal = nothing.clone(), nothing.clone()
-        routes = no_vertex.clone(), last_goal, no_vertex, torch.zeros_like(no_vertex), torch.ones_like(no_vertex)
+        trust = torch.zeros_like(no_vertex), nothing.clone(), torch.ones_like(no_vertex)
+        routes = no_vertex.clone(), last_goal, no_vertex, *trust
         still = torch.zeros_like(q)
         arms = Arms(q, still, nothing, off, held, q * torch.nan, *routes, still.clone())
         arms.look(follower, torch.arange(len(q)))
@@ -129,7 +132,9 @@ class Pilot:
         nowhere = torch.full_like(arms.q[which], torch.nan)
         steps = Steps(arms.q[which], nowhere, unknown, torch.full((len(which),), DETOURING))
         left = torch.ones(len(which), dtype=torch.bool)
-        on_way = ((arms.blind[which] > 0) & (arms.next_vertex[which] >= 0) & arms.on_task[which]).nonzero()[:, 0]
+        same = (targets - arms.aimed[which]).norm(dim=1) <= _SAME_GOAL
+        blind = same & (arms.blind[which] > 0) & (arms.next_vertex[which] >= 0) & arms.on_task[which]
+        on_way = blind.nonzero()[:, 0]
         if len(on_way):
             arms.blind[which[on_way]] -= 1
             steps.q[on_way], left[on_way] = self._route(arms, which[on_way])
@@ -152,8 +157,8 @@ class Pilot:
         steps = Steps(q, torch.full_like(q, torch.nan), p, torch.full((len(which),), TRACKING))
         rows = (~lost).nonzero()[:, 0]
         if len(rows):
-            guesses, codes = self.solver.guess(targets[rows])
-            rows, guesses = rows[codes <= 1], guesses[codes <= 1]
+            guesses, codes = self.solver.guess(targets[rows].to(torch.float64))
+            rows, guesses = rows[codes <= 1], guesses[codes <= 1].to(targets)
         if len(rows):
             lines = self.follower.follow(q[rows], p[rows], guesses, targets[rows], arms.offsets[which[rows]])
             offsets = difference(guesses, lines.ends, self.follower.robot.continuous)
@@ -208,7 +213,7 @@ class Pilot:
         if len(routed):
             self._set_goals(arms, which[routed], goals[routed], goals_q[routed])
             steps.q[routed], left[routed] = self._route(arms, which[routed], looked=True)
-            arms.blind[which[routed]] = arms.doubt[which[routed]]
+            arms.blind[which[routed]], arms.aimed[which[routed]] = arms.doubt[which[routed]], targets[routed]
         for row in left.nonzero()[:, 0].tolist():
             step = self._back(arms, int(which[row]), goals_q[row])
             if step is None:

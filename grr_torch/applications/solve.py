@@ -76,7 +76,9 @@ class Solver:
         if len(vertices) == 0:
             raise ParameterError("roadmap", "one without a resolved vertex", "one to solve with")
         points = roadmap.points[:, : self.task.dimension]
-        self.points, self.configurations, self.vertices = roadmap.points, roadmap.configurations, vertices
+        kept = (part.to(self.robot.dtype) for part in (roadmap.points, roadmap.configurations))
+        self.points, self.configurations = kept
+        self.vertices = vertices
         self.low = points.amin(0)
         slack = 1e-9
         self._low, self._high = self.low.numpy() - slack, points.amax(0).numpy() + slack
@@ -84,19 +86,19 @@ class Solver:
         turning = self.task.rotations is not None
         self._around = (AroundProduct if turning else Around)(roadmap, vertices, self.radius)
         self._continuous = self.robot.continuous.cpu()
-        self._embedded = embed(roadmap.configurations[vertices], self._continuous)
+        self._embedded = embed(roadmap.configurations[vertices].to(torch.float64), self._continuous)
         self._neighbours = tuple(part.numpy() for part in roadmap.neighbours)
         self._joined = _neighbour_matrix(roadmap, vertices).numpy() if len(vertices) <= _MATRIX else None
         # where rotation varies, suspects are looked up by their nearest vertices
         self._lattice = None if turning else find_lattice(roadmap.points)
         self._suspect = self._uncertified_places(roadmap)
-        # of a large roadmap, such a table would take long to make
-        small = self._suspect is not None and len(vertices) <= _MATRIX
+        # of a large roadmap, such a table would take long to make; without a grid there is no other way
+        small = self._suspect is not None and (self._lattice is None or len(vertices) <= _MATRIX)
         self._near_suspect = self._near_uncertified(roadmap) if small else None
 
     def __call__(self, points: Tensor, *, progress: Progress = silent) -> Solution:
         """`Roadmap.solve`."""
-        columns = point_columns(self.robot, self.task, points)
+        columns = point_columns(self.robot, self.task, points.detach() if isinstance(points, Tensor) else points)
         batch, count = points.shape[:-1], columns.shape[1]
         q = columns.new_empty(count, self.robot.n)
         codes = torch.empty(count, dtype=torch.uint8)

@@ -101,9 +101,11 @@ def _fits_one(value: Any, hint: Any) -> bool:
         return isinstance(value, dict) and all(
             _fits(key, inside[0]) and _fits(item, inside[1]) for key, item in value.items()
         )
-    if issubclass(origin, tuple) and len(inside) == len(get_args(hint)) and len(inside) != len(value or ()):
+    if not isinstance(value, list):
         return False
-    return isinstance(value, list) and all(any(_fits(item, part) for part in inside) for item in value)
+    if issubclass(origin, tuple) and len(inside) == len(get_args(hint)) and len(inside) != len(value):
+        return False
+    return all(any(_fits(item, part) for part in inside) for item in value)
 
 
 def _describe(hint: Any) -> str:

@@ -11,7 +11,7 @@ from grr_torch.errors import OutputError
 from grr_torch.fleet.catalogue import CATALOGUE, Row, forget_failure, is_there, record_failure, write_catalogue
 from grr_torch.fleet.order import Order
 from grr_torch.fleet.work import Work, make_roadmap
-from grr_torch.output import check_writable
+from grr_torch.output import PARTIAL, check_writable
 from grr_torch.progress import Progress, silent
 
 # told of each order that ended, and why it failed, or None
@@ -113,6 +113,6 @@ def _alone(folder: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise OutputError(folder, "another sweep is at work there") from error
-        for path in folder.glob(".*.partial.*"):
+        for path in folder.glob(PARTIAL):
             path.unlink(missing_ok=True)
         yield

@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.learning.encoding import Encoding
-from grr_torch.learning.sample import draw_samples
+from grr_torch.learning.sample import check_learnable, draw_samples
 from grr_torch.learning.split import SPLITS, Split
 from grr_torch.progress import Progress, silent
 
@@ -56,6 +56,7 @@ class RoadmapDataset(Dataset[tuple[Tensor, Tensor]]):
         Raises:
             ParameterError: No vertex is resolved, no cell is certified, or a number is not valid.
         """
+        check_learnable(roadmap)
         split = split or Split(seed=seed)
         if samples is None:
             if not bool(roadmap.resolved.any()):

@@ -211,7 +211,7 @@ def pose_errors(roadmap: Roadmap, points: Tensor, q: Tensor, steps: int = 0) -> 
 def draw_lines(region: Region, generator: torch.Generator) -> Tensor:
     """(W, 11, d) windows of a centimetre, every millimetre of random lines, that lie in the region."""
     ends = region.draw(2 * _LINES, generator).reshape(_LINES, 2, -1)
-    windows: list[Tensor] = []
+    windows: list[Tensor] = [region.corners.new_empty(0, _PER_CENTIMETRE + 1, region.corners.shape[2])]
     for start, end in ends:
         count = int((end - start).norm() * 100.0 * _PER_CENTIMETRE)
         direction = (end - start) / max(float((end - start).norm()), 1e-12)

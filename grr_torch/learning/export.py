@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grr_torch.errors import ParameterError
-from grr_torch.learning.sample import draw_samples
+from grr_torch.learning.sample import check_learnable, draw_samples
 from grr_torch.learning.split import SPLITS, Split
 from grr_torch.output import atomic_write, check_writable
 from grr_torch.progress import Progress, silent
@@ -80,6 +80,7 @@ def export_dataset(
         OutputError: It cannot be written.
     """
     check_dataset_path("out", out)
+    check_learnable(roadmap)
     split = split or Split(seed=seed)
     columns = _columns(roadmap, jacobians)
     units = _units(roadmap, columns)

@@ -36,6 +36,16 @@ class Samples:
     split: Tensor
 
 
+def check_learnable(roadmap: Roadmap) -> None:
+    """Checks that a network can be trained from a roadmap.
+
+    Raises:
+        ParameterError: Rotation varies in its task.
+    """
+    if roadmap.task.rotations is not None:
+        raise ParameterError("task", roadmap.task.kind, "position or fixed-rotation: varying rotation is not learned")
+
+
 def draw_samples(
     roadmap: Roadmap, count: int, split: Split, *, seed: int = 0, progress: Progress = silent
 ) -> Iterator[Samples]:

@@ -19,6 +19,7 @@ from grr_torch.learning.loss import IkLoss
 from grr_torch.learning.network import IkNetwork
 from grr_torch.learning.neural_ik import NeuralIK, Origin
 from grr_torch.learning.options import Epoch, TrainingOptions
+from grr_torch.learning.sample import check_learnable
 from grr_torch.output import check_writable
 from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress, silent
@@ -67,6 +68,7 @@ def train_ik(
         FileFormatError: The state to resume from is missing, or of another training.
         TrainingError: The loss is not finite.
     """
+    check_learnable(roadmap)
     options = options or TrainingOptions()
     resolved = int(roadmap.resolved.sum())
     if resolved < _FEWEST_VERTICES:

@@ -94,7 +94,8 @@ def _step(limits: Limits | None, q: Array, jacobian: Array, error: Array, dampin
 
 def _damped_least_squares(jacobian: Array, error: Array, damping: Array) -> Array:
     """`columns.damped_least_squares`: steps (n, M); LAPACK, one call for all, is faster for very few."""
-    if jacobian.shape[2] > _LAPACK:
+    # in single precision the damping may be lost, and one singular column would make LAPACK give up all
+    if jacobian.shape[2] > _LAPACK or jacobian.dtype != np.float64:
         return damped_least_squares(*(torch.from_numpy(array) for array in (jacobian, error, damping))).numpy()
     rows = jacobian.transpose(2, 0, 1)
     columns = rows.transpose(0, 2, 1)

@@ -126,6 +126,8 @@ def project_columns(
     check_collision: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """`project` for columns: targets (width, N) and guesses (n, N) give configurations (n, N) and valid (N,)."""
+    if q.shape[1] == 0:
+        return q.clone(), torch.zeros(0, dtype=torch.bool, device=q.device)
     with torch.no_grad(), one_thread():
         limits = Limits.of(robot)
         if are_few(q):

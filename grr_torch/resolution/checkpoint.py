@@ -21,7 +21,7 @@ from typing import Any
 from torch import Tensor
 
 from grr_torch.errors import FileFormatError, GrrWarning, OutputError
-from grr_torch.output import atomic_write
+from grr_torch.output import PARTIAL, atomic_write
 from grr_torch.tensor_file import read_tensors, tensor_hash, write_tensors
 
 # a stage that is under way is written no sooner after the last time [s]
@@ -154,9 +154,8 @@ class Checkpoint:
     def _open(self, folder: Path, build: dict[str, Any], resume: bool) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            for path in folder.glob(".*.partial*"):  # of a run that was killed
-                path.unlink()
-            present = sorted(path.name for path in folder.iterdir())
+            partial = set(folder.glob(PARTIAL))  # of a run that was killed
+            present = sorted(path.name for path in folder.iterdir() if path not in partial)
         except OSError as error:
             raise OutputError(folder, str(error.strerror or error)) from error
         if not present:
@@ -166,6 +165,8 @@ class Checkpoint:
         if not resume:
             raise OutputError(folder, "it is not empty; valid: another folder, or --resume to go on from what is there")
         _check_build(folder / _BUILD, build)
+        for path in partial:
+            path.unlink(missing_ok=True)
         if _ROADMAP in present:
             self.roadmap = folder / _ROADMAP
             _read_whole(self.roadmap)

@@ -107,7 +107,7 @@ def _relaxed(
     network = _network(roadmap, vertices, rank[edges], weights)
     old = roadmap.configurations[vertices].to(roadmap.robot.lower)
     new = relax(network, old.T.contiguous(), tolerances, progress, kept=checkpoint.stage("relaxation"))
-    cells = rank[roadmap.graph.triangles(roadmap.connected)]
+    cells = rank[roadmap.graph.triangles(roadmap.connected)].to(roadmap.robot.device)
     new = certify(network, cells, new, tolerances, progress, checkpoint).T
     configurations = roadmap.configurations.clone()
     configurations[vertices] = new.cpu()

@@ -47,7 +47,12 @@ def draw(count: int, most: int, seed: int = 0) -> Tensor:
     """Numbers (K,) below `count` in order: all of them, or `most` random ones, none twice."""
     if count <= most:
         return torch.arange(count)
-    return torch.randint(count, (most,), generator=torch.Generator().manual_seed(seed)).unique()
+    generator = torch.Generator().manual_seed(seed)
+    if count <= 4 * most:
+        return torch.randperm(count, generator=generator)[:most].sort().values
+    # of so many, half as many again are drawn: enough are left when the same ones are counted once
+    drawn = torch.randint(count, (most + most // 2,), generator=generator).unique()
+    return drawn[torch.randperm(len(drawn), generator=generator)[:most]].sort().values
 
 
 def _are_edges(keys: Tensor, wanted: Tensor) -> Tensor:

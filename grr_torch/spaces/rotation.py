@@ -12,8 +12,9 @@ from grr_torch.pieces import Array
 
 # below any sine of an angle that is not 0, and above what a division makes infinite
 _TINY = 1e-30
-# cosines of angles to which the axis may have to be found otherwise
-_HALF_TURN = -1.0 + 1e-12
+# how far from −1 cosines are of angles to which the axis may have to be found otherwise, and sines of such angles
+_HALF_TURN = 1e-12
+_STRAIGHT = 1e-7
 
 
 def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Tensor:
@@ -95,9 +96,10 @@ def rotation_error(target: Tensor, rotation: Tensor) -> Tensor:
     # the tiny number is lost beside any sine but 0
     sine = twisted.square().sum(0).sqrt_().add_(_TINY)
     error = twisted * torch.atan2(sine, cosine).div_(sine)
-    flipped = cosine < _HALF_TURN
+    precision = torch.finfo(turn.dtype).eps
+    flipped = cosine < -1.0 + max(_HALF_TURN, 8.0 * precision)
     if bool(flipped.any()):
-        flipped &= sine < 1e-7
+        flipped &= sine < max(_STRAIGHT, precision**0.5)
         # at π, T Rᵀ = 2 a aᵀ − 1: any column of T Rᵀ + 1 points along the axis
         outer = turn[..., flipped] + torch.eye(3, dtype=turn.dtype, device=turn.device)[..., None]
         column = torch.take_along_dim(outer, outer.norm(dim=0).argmax(0)[None, None], dim=1)[:, 0]
@@ -110,7 +112,7 @@ def rotation_error_of_few(target: Array, rotation: Array) -> Array:
     turn = (target.astype(rotation.dtype) @ rotation.transpose(1, 0, 2).reshape(3, -1)).reshape(9, -1)
     twisted = 0.5 * (turn[[7, 2, 3]] - turn[[5, 6, 1]])
     cosine = 0.5 * (turn[0] + turn[4] + turn[8] - 1.0)
-    if (cosine < _HALF_TURN).any():
+    if (cosine < -1.0 + max(_HALF_TURN, 8.0 * float(np.finfo(turn.dtype).eps))).any():
         tensors = torch.from_numpy(target).to(torch.from_numpy(rotation))[..., None], torch.from_numpy(rotation)
         return rotation_error(*tensors).numpy()
     sine = np.sqrt((twisted * twisted).sum(0)) + _TINY
