@@ -26,7 +26,7 @@ def sweep(
         typer.Option(help="Folder of the roadmaps; by default named like the sweep. A cluster must share it."),
     ] = None,
 ) -> None:
-    """Build the roadmaps of a fleet that are missing, and the catalogue of them all; exit code 1 if some fail.
+    r"""Build the roadmaps of a fleet that are missing, and the catalogue of them all; exit code 1 if some fail.
 
     Example: grr-torch sweep factory.yaml --engine ray --out factory
 
@@ -34,7 +34,7 @@ def sweep(
 
     defaults: {robot: planar_5, points: 300}
 
-    grid: {task: [position, fixed-rotation], seed: [0, 1, 2]}
+    grid: {task: \[position, fixed-rotation], seed: [0, 1, 2]}
 
     builds: [{robot: kinova, objectives: {clearance: 0.5}}]
 

@@ -84,6 +84,7 @@ def load_roadmap(path: str | os.PathLike[str], robot: Robot | None = None) -> Ro
     """Reads a roadmap; see `Roadmap.load`. A `robot` may be given in place of the file's, as which it was checked."""
     metadata, tensors = read_file(path)
     _check_tensors(path, tensors)
+    _check_indices(path, tensors)
     try:
         missing = {field.name for field in fields(Quality)} - set(metadata["quality"])
         if missing:
@@ -220,3 +221,19 @@ def _check_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) 
         demand(len(tensors[name]) == length, f"tensor '{name}' has {len(tensors[name])} rows, not {length}")
     for name, width in {"edges": 2, "uncertified_triangles": 3, "uncertified_squares": 4}.items():
         demand(tensors[name].shape[1] == width, f"tensor '{name}' has rows of {tensors[name].shape[1]}, not {width}")
+
+
+def _check_indices(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> None:
+    """That what names vertices names some that are there.
+
+    Raises:
+        FileFormatError: It does not.
+    """
+    count, ends = len(tensors["points"]), len(tensors["neighbour_ends"])
+    most = {name: count for name in ("edges", "neighbour_ends", "uncertified_triangles", "uncertified_squares")}
+    for name, limit in {**most, "neighbour_starts": ends + 1}.items():
+        if tensors[name].numel():
+            low, high = (int(value) for value in torch.aminmax(tensors[name]))
+            if low < 0 or high >= limit:
+                reason = f"is corrupt: tensor '{name}' has entries from {low} to {high}; valid: 0 to {limit - 1}"
+                raise FileFormatError(path, reason)
