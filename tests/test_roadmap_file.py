@@ -176,7 +176,6 @@ def test_a_damaged_file_is_a_clear_error(saved, how):
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
-        ("edges", 10_000, "vertices that do not exist"),
         ("configurations", torch.nan, "without a finite configuration"),
         ("points", torch.inf, "points that are not finite"),
         ("wave", -1, "waves that do not fit"),
@@ -184,13 +183,22 @@ def test_a_damaged_file_is_a_clear_error(saved, how):
 )
 def test_contents_that_contradict_each_other_are_found_when_asked_for(saved, name, value, reason):
     tensors, metadata = load_file(saved), header(saved)
-    row = 0 if name == "edges" else int(tensors["resolved"].nonzero()[0, 0])
-    tensors[name][row] = value
+    tensors[name][int(tensors["resolved"].nonzero()[0, 0])] = value
     save_file(tensors, saved, metadata=metadata)
     checks = {check.name: check for check in verify_file(saved)}
     assert reason in checks["contents"].detail
     assert {name for name, check in checks.items() if not check.passed} == {"tensors", "contents"}
     assert name in checks["tensors"].detail
+
+
+@pytest.mark.parametrize("name", ["edges", "neighbour_starts", "neighbour_ends", "uncertified_triangles"])
+@pytest.mark.parametrize("value", [-1, 1_000_000])
+def test_vertices_that_are_not_there_are_found_when_a_file_is_opened(saved, name, value):
+    tensors, metadata = load_file(saved), header(saved)
+    tensors[name][0] = value
+    save_file(tensors, saved, metadata=metadata)
+    with pytest.raises(FileFormatError, match=f"tensor '{name}' has entries from"):
+        grr_torch.Roadmap.load(saved)
 
 
 @pytest.mark.parametrize("name", ["neighbour_ends", "uncertified_triangles"])

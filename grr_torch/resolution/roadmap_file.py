@@ -230,7 +230,7 @@ def _check_indices(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) 
         FileFormatError: It does not.
     """
     count, ends = len(tensors["points"]), len(tensors["neighbour_ends"])
-    most = {name: count for name in ("edges", "neighbour_ends", "uncertified_triangles", "uncertified_squares")}
+    most = dict.fromkeys(("edges", "neighbour_ends", "uncertified_triangles", "uncertified_squares"), count)
     for name, limit in {**most, "neighbour_starts": ends + 1}.items():
         if tensors[name].numel():
             low, high = (int(value) for value in torch.aminmax(tensors[name]))
