@@ -56,11 +56,14 @@ class Checkpoint:
         Raises:
             FileFormatError: It is missing, truncated, damaged, or of another training.
         """
+        if not self.path.exists():
+            raise FileFormatError(self.path, "is not a file: the training has ended, or was never begun")
         metadata, tensors = read_tensor_file(self.path, FORMAT, FORMAT_VERSION, "a state of a training")
         wanted, found = _flat(json.loads(json.dumps(dict(self.identity)))), _flat(metadata)
         others = [name for name, value in wanted.items() if found.get(name) != value]
         if others:
-            raise FileFormatError(self.path, f"is of a training with other {', '.join(others)}")
+            differ = ", ".join(f"{name} (there {found.get(name)!r}, here {wanted[name]!r})" for name in others)
+            raise FileFormatError(self.path, f"is of a training with other {differ}")
         if tensors_hash(tensors) != metadata.get("tensors_sha256") or not {"epoch", "best"} <= set(metadata):
             raise FileFormatError(self.path, "holds another state than was written")
         return metadata, tensors
