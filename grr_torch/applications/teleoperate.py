@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from grr_torch.applications.arms import Arms
 from grr_torch.applications.braking import limit_acceleration
 from grr_torch.applications.lines import Follower
-from grr_torch.applications.pilot import HOLDING, Arms, Pilot
+from grr_torch.applications.pilot import HOLDING, Pilot
 from grr_torch.applications.retime import per_joint, usual_speeds
 from grr_torch.applications.routes import Routes
 from grr_torch.errors import ParameterError
