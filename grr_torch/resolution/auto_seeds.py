@@ -2,9 +2,10 @@
 
 A candidate starts from one configuration, a medoid of the self-motion manifold of some point, and is led once round
 the axis of the first joint. Turned rigidly with that joint and projected, a posture that the task allows all round
-closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph, the best of
-them relaxed there and, if many are asked for, on the task graph itself; the one with the smallest slopes, where what
-is missing counts as steep, seeds the roadmap.
+closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph and the best of
+them relaxed there: so few vertices soon come to rest, and what they come to is nearly the same from many candidates. The
+best of these maps are expanded and relaxed on the task graph itself; the one with the smallest slopes, where what is
+missing counts as steep, seeds the roadmap with all its coarse vertices.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from grr_torch.spaces.product import ProductGraph, product_graph
 from grr_torch.spaces.task import TaskSpace
 
 # candidates that are looked for, unless told otherwise
-CANDIDATES = 120
+CANDIDATES = 60
 _MOST_CANDIDATES = 10_000
 # of each point's self-motion manifold, random starts and medoids; each medoid gives two candidates
 _STARTS = 48
@@ -37,17 +38,17 @@ _TRIED = 3
 # seeds on a closed path
 _STATIONS = 12
 # vertices of the coarse graph that the arm should reach, in the plane and in space
-_COARSE = {2: 300, 3: 300}
+_COARSE = {2: 120, 3: 300}
 # so many times as many, and so many rotations at least, where rotation varies
 _TURNED, _FEWEST = 4, 8
 # vertices averaged over on it
 _NEIGHBOURS = 24
-# share of the candidates that are relaxed on it, and of those that are relaxed on the task graph itself
+# share of the candidates that are relaxed on it, and of those that are tried on the task graph itself
 _RELAXED = 0.08
-_FINALISTS = 0.04
+_FINALISTS = 0.03
 # in so many rounds each
-_ROUNDS = 10
-_FINAL_ROUNDS = 40
+_ROUNDS = 16
+_FINAL_ROUNDS = 8
 # edges steeper than this many times the median are not relaxed
 _STEEP = 6.0
 # an edge that is missing, or steeper, counts as this many times the smallest median of slopes
@@ -70,8 +71,7 @@ def find_seeds(
         robot: The robot.
         task: The task space.
         graph: The task graph that will be expanded; a coarser one over its bounds is tried out first.
-        candidates: How many sets of seeds are compared; of more than the default, the best are compared again on the
-            task graph itself, which takes far longer.
+        candidates: How many sets of seeds are compared.
         seed: Of all random draws.
         tolerances: Of the projections.
         progress: Told what is being done and how far it is.
@@ -91,18 +91,15 @@ def find_seeds(
     neighbours = _NEIGHBOURS if task.rotations is None else default_neighbours(task)
     maps = _expansions(robot, task, coarse, paths, neighbours, tolerances)
     progress("choosing seeds", 1, 3)
-    best = _costs(robot, task, coarse, maps).argsort(stable=True)[: math.ceil(_RELAXED * len(paths))].tolist()
-    relaxed = _relaxed(robot, task, coarse, maps[best], tolerances, _ROUNDS)
-    order = _costs(robot, task, coarse, relaxed).argsort(stable=True)
-    finalists = [paths[best[rank]] for rank in order.tolist()]
+    best = _costs(robot, task, coarse, maps).argsort(stable=True)[: math.ceil(_RELAXED * len(paths))]
+    relaxed = _relaxed(robot, task, coarse, maps[best.to(maps.device)], tolerances, _ROUNDS)
+    order = _costs(robot, task, coarse, relaxed).argsort(stable=True)[: math.ceil(_FINALISTS * len(paths))].tolist()
+    finalists = [relaxed[rank][~relaxed[rank].isnan().any(1)] for rank in order]
     progress("choosing seeds", 2, 3)
-    if candidates <= CANDIDATES:
-        return finalists[0]
-    finalists = finalists[: math.ceil(_FINALISTS * len(paths))]
     maps = _expansions(robot, task, graph, finalists, default_neighbours(task), tolerances)
-    relaxed = _relaxed(robot, task, graph, maps, tolerances, _FINAL_ROUNDS)
+    costs = _costs(robot, task, graph, _relaxed(robot, task, graph, maps, tolerances, _FINAL_ROUNDS))
     progress("choosing seeds", 3, 3)
-    return finalists[int(_costs(robot, task, graph, relaxed).argmin())]
+    return finalists[int(costs.argmin())]
 
 
 def _coarse(task: TaskSpace, graph: TaskGraph, points: int) -> TaskGraph:
