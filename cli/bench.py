@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from grr_torch.cli.bench_cluster import cluster
+from grr_torch.cli.bench_effort import effort
 from grr_torch.cli.bench_learning import learning
 from grr_torch.cli.bench_rotations import rotations
 from grr_torch.cli.bench_scale import scale
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 app = typer.Typer(name="bench", help="Measure: the tables of the README.", no_args_is_help=True)
 
 
+app.command()(effort)
 app.command()(teleop)
 app.command()(learning)
 app.command()(rotations)

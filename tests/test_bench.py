@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.experiments import peers
+from grr_torch.experiments.effort import measure_effort
 from grr_torch.experiments.profile import profile_build
 from grr_torch.experiments.projection_cost import count_operators, projection_cost
 from grr_torch.experiments.speed import SECTIONS, measure_speed
@@ -134,3 +135,15 @@ def test_operators_are_counted_with_their_operations():
     assert counter.operators == 3
     assert counter.products == 2 * 3 * 5 * 7
     assert counter.pointwise == 2 * 21 + 21
+
+
+def test_only_roadmaps_that_no_other_beats_are_shown():
+    best = measure_effort(3, robots=["planar_5"], tasks=["fixed-rotation"])
+    assert best
+    assert not any(one.beats(other) for one in best for other in best)
+    smoothness = [one.quality.smoothness for one in best]
+    assert smoothness == sorted(smoothness)
+    with pytest.raises(ParameterError, match="draws"):
+        measure_effort(0)
+    with pytest.raises(UnknownNameError, match="fixed-rotation"):
+        measure_effort(1, tasks=["pose"])

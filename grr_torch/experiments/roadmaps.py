@@ -55,6 +55,20 @@ class Result:
         return {**{name: getattr(self, name) for name in names}, "paper": self.paper, **self.quality.to_dict()}
 
 
+def chosen_problems(robots: Sequence[str] | None = None, tasks: Sequence[str] | None = None) -> list[tuple[str, str]]:
+    """Of the four problems, those of some robots and tasks; of all by default.
+
+    Raises:
+        UnknownNameError: No such robot or task.
+    """
+    known = tuple(tuple(dict.fromkeys(names)) for names in zip(*PROBLEMS, strict=True))
+    for names, kind, which in ((robots, "robot", known[0]), (tasks, "task", known[1])):
+        for name in names or ():
+            if name not in which:
+                raise UnknownNameError(kind, name, which)
+    return [(robot, task) for robot, task in PROBLEMS if robot in (robots or known[0]) and task in (tasks or known[1])]
+
+
 def measure_roadmaps(
     *,
     robots: Sequence[str] | None = None,
@@ -77,11 +91,10 @@ def measure_roadmaps(
     Raises:
         UnknownNameError: No such robot or method.
     """
-    for names, known, kind in ((robots, ("planar_5", "kinova"), "robot"), (methods, METHODS, "method")):
-        for name in names or ():
-            if name not in known:
-                raise UnknownNameError(kind, name, known)
-    problems = [problem for problem in PROBLEMS if robots is None or problem[0] in robots]
+    for name in methods or ():
+        if name not in METHODS:
+            raise UnknownNameError("method", name, METHODS)
+    problems = chosen_problems(robots)
     jobs = [(robot, task, method) for robot, task in problems for method in (methods or METHODS)]
     results: list[Result] = []
     for index, (name, task, method) in enumerate(jobs):

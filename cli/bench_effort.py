@@ -1,0 +1,60 @@
+"""`grr-torch bench effort`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+
+if TYPE_CHECKING:
+    from grr_torch.experiments.effort import Best
+
+
+@reports_errors
+def effort(
+    draws: Annotated[int, typer.Option(min=1, help="How often seeds are found, each time from another generator.")] = 60,
+    robot: Annotated[list[str] | None, typer.Option(help="planar_5 or kinova; repeatable; both by default.")] = None,
+    task: Annotated[
+        list[str] | None, typer.Option(help="position or fixed-rotation; repeatable; both by default.")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+) -> None:
+    """Print the best refined roadmaps of many draws of found seeds, as a Markdown table.
+
+    A roadmap is left out if another one of its problem is as good in vertices, edges, smoothness and certified triangles,
+    and better in one of them. Takes some minutes a problem.
+
+    Example: grr-torch bench effort --robot kinova --task position --draws 20
+    """
+    from grr_torch.experiments.effort import measure_effort
+    from grr_torch.experiments.timing import machine
+    from grr_torch.output import atomic_write, check_writable
+
+    if json_file is not None:
+        check_writable(json_file)
+    with progress_bar() as progress:
+        results = measure_effort(draws, robots=robot, tasks=task, progress=progress)
+    if json_file is not None:
+        with atomic_write(json_file) as path:
+            data = {"machine": machine(), "draws": draws, "roadmaps": [result.to_dict() for result in results]}
+            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
+    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    head = ["problem", "seeds", "resolved", "connected", "smoothness", "certified triangles", "time [s]"]
+    typer.echo(markdown_table(head, [_row(result) for result in results]))
+
+
+def _row(result: Best) -> list[str]:
+    quality = result.quality
+    certified = quality.triangles_certified
+    return [
+        f"{result.robot} {result.task}",
+        "preset" if result.seed is None else f"auto, --seed {result.seed}",
+        f"{quality.resolved_vertices:,}",
+        f"{quality.connected_edges:,}",
+        "none" if quality.smoothness is None else f"{quality.smoothness:.4f}",
+        "" if certified is None else f"{100.0 * certified:.2f} %",
+        f"{result.seconds:.2f}",
+    ]
