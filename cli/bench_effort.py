@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @reports_errors
 def effort(
-    draws: Annotated[int, typer.Option(min=1, help="How often seeds are found, each time from another generator.")] = 60,
+    draws: Annotated[int, typer.Option(min=1, help="How often seeds are found, each time anew.")] = 60,
     robot: Annotated[list[str] | None, typer.Option(help="planar_5 or kinova; repeatable; both by default.")] = None,
     task: Annotated[
         list[str] | None, typer.Option(help="position or fixed-rotation; repeatable; both by default.")
@@ -24,8 +24,8 @@ def effort(
 ) -> None:
     """Print the best refined roadmaps of many draws of found seeds, as a Markdown table.
 
-    A roadmap is left out if another one of its problem is as good in vertices, edges, smoothness and certified triangles,
-    and better in one of them. Takes some minutes a problem.
+    A roadmap is left out if another one of its problem is as good in vertices, edges, smoothness and certified
+    triangles, and better in one of them. Takes some minutes a problem.
 
     Example: grr-torch bench effort --robot kinova --task position --draws 20
     """

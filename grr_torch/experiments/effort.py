@@ -89,4 +89,3 @@ def measure_effort(
         results += sorted(best.values(), key=lambda one: one.merits[2], reverse=True)
     progress("done", 1, 1)
     return results
-

@@ -2,10 +2,10 @@
 
 A candidate starts from one configuration, a medoid of the self-motion manifold of some point, and is led once round
 the axis of the first joint. Turned rigidly with that joint and projected, a posture that the task allows all round
-closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph and the best of
-them relaxed there: so few vertices soon come to rest, and what they come to is nearly the same from many candidates. The
-best of these maps are expanded and relaxed on the task graph itself; the one with the smallest slopes, where what is
-missing counts as steep, seeds the roadmap with all its coarse vertices.
+closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph and the best
+of them relaxed there: so few vertices soon come to rest, and many candidates come to nearly the same. The best of these
+maps are expanded and relaxed on the task graph itself; the one with the smallest slopes, where what is missing counts
+as steep, seeds the roadmap with all its coarse vertices.
 """
 
 from __future__ import annotations
