@@ -31,6 +31,7 @@ class Arms:
         aimed: (B, width) the target for which it does so; a target elsewhere is looked for at once.
         doubt: (B,) how many these are the next time.
         offsets: (B, n) what the last end of a line differed from its guess by.
+        barred: (B, width) the last target that a route led near, without a way on from there; NaN where there is none.
     """
 
     q: Tensor
@@ -46,6 +47,7 @@ class Arms:
     aimed: Tensor
     doubt: Tensor
     offsets: Tensor
+    barred: Tensor
 
     @staticmethod
     def at(follower: Follower, q: Tensor) -> Arms:
@@ -56,7 +58,7 @@ class Arms:
         trust = torch.zeros_like(no_vertex), nothing.clone(), torch.ones_like(no_vertex)
         routes = no_vertex.clone(), last_goal, no_vertex, *trust
         still = torch.zeros_like(q)
-        arms = Arms(q, still, nothing, off, held, q * torch.nan, *routes, still.clone())
+        arms = Arms(q, still, nothing, off, held, q * torch.nan, *routes, still.clone(), nothing.clone())
         arms.look(follower, torch.arange(len(q)))
         return arms
 
@@ -69,8 +71,12 @@ class Arms:
         turned = task.residuals(error)[1] <= _OFF_TASK * follower.tolerances.rotation
         self.on_task[which] = turned & robot.within_limits(q) & ~robot.in_self_collision(q)
 
+    def barred_from(self, which: Tensor, targets: Tensor, distance: float) -> Tensor:
+        """Whether some arms (A,) are given targets (A, width) within a distance [m] of the one that they are barred from."""
+        return (targets - self.barred[which]).norm(dim=1) <= distance
+
     def forget(self, which: Tensor) -> None:
         """Arms (A,) that have no more need of a route or a point to hold at."""
-        self.held[which] = self.held_q[which] = torch.nan
+        self.held[which] = self.held_q[which] = self.barred[which] = torch.nan
         self.next_vertex[which] = -1
         self.blind[which] = 0

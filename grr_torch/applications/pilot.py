@@ -99,8 +99,9 @@ class Pilot:
             offsets = difference(guesses, lines.ends, self.follower.robot.continuous)
             fits = offsets.norm(dim=1) <= _OFFSET
             arms.offsets[which[rows]] = torch.where((lines.converged & fits)[:, None], offsets, 0.0)
-            valid[rows] = lines.converged & ~lines.collides & self.solver.on_map(lines.ends, guesses)
-            direct[rows] = valid[rows] & lines.direct & arms.on_task[which[rows]]
+            found = lines.converged & ~lines.collides & self.solver.on_map(lines.ends, guesses)
+            direct[rows] = found & lines.direct & arms.on_task[which[rows]]
+            valid[rows] = direct[rows] | (found & ~arms.barred_from(which[rows], targets[rows], _SAME_GOAL))
             steps.q[rows], steps.goals[rows], steps.points[rows] = lines.steps, lines.ends, lines.points
         if bool(direct.all()):
             arms.forget(which)
@@ -119,7 +120,10 @@ class Pilot:
         """Looks for the nearest points to targets (A, width) that arms can hold at; which targets are solvable (A,)."""
         unset = arms.held[which].isnan().any(1)
         base = torch.where(unset[:, None], arms.p[which], arms.held[which])
-        arms.held[which], arms.held_q[which], solved = nearest_feasible(self.solver, base, arms.held_q[which], targets)
+        # what is not to be gone to by any route must not be where a jump leads
+        near = unset & arms.barred_from(which, targets, _SAME_GOAL)
+        base_q = torch.where(near[:, None], arms.q[which], arms.held_q[which])
+        arms.held[which], arms.held_q[which], solved = nearest_feasible(self.solver, base, base_q, targets)
         return solved
 
     def _indirect(self, arms: Arms, which: Tensor, targets: Tensor, valid: Tensor, ends: Tensor) -> Steps:
@@ -149,6 +153,7 @@ class Pilot:
             self._set_goals(arms, which[routed], goals[routed], goals_q[routed])
             steps.q[routed], left[routed] = self._route(arms, which[routed], looked=True)
             arms.blind[which[routed]], arms.aimed[which[routed]] = arms.doubt[which[routed]], targets[routed]
+            self._find_ended(arms, which[routed], steps.q[routed], targets[routed])
         for row in left.nonzero()[:, 0].tolist():
             step = self._back(arms, int(which[row]), goals_q[row])
             if step is None:
@@ -156,6 +161,21 @@ class Pilot:
             else:
                 steps.q[row] = step
         return steps
+
+    def _find_ended(self, arms: Arms, which: Tensor, steps: Tensor, targets: Tensor) -> None:
+        """Looks for arms (A,) whose next configurations (A, n) are where they stand: their route has come to nothing.
+
+        At a vertex whose next edge cannot be followed, another route is taken from now on. Where there is no way on
+        from the last vertex, the arm is to go as near to its target (A, width) as it can.
+        """
+        for row in ((steps - arms.q[which]).abs().amax(1) <= _ARRIVED).nonzero()[:, 0].tolist():
+            arm = int(which[row])
+            here, last = int(arms.next_vertex[arm]), int(arms.last_vertex[arm])
+            if here >= 0 and here != last and (following := int(self.routes.towards(last)[1][here])) >= 0:
+                self.routes.block(here, following)
+            else:
+                arms.barred[arm] = targets[row]
+            arms.blind[arm] = 0
 
     def _set_goals(self, arms: Arms, which: Tensor, goals: Tensor, goals_q: Tensor) -> None:
         """Looks for the last vertices of arms' routes again, where the goals (A, width) have moved."""

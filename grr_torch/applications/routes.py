@@ -52,6 +52,13 @@ class Routes:
         """
         return dijkstra(self._graph, directed=False, indices=goal, return_predecessors=True)
 
+    def block(self, first: int, second: int) -> None:
+        """Leaves an edge out of all paths from now on."""
+        kept = self._graph.tolil()
+        kept[first, second] = kept[second, first] = 0.0
+        self._graph = kept.tocsr()
+        self.towards.cache_clear()
+
     def between(self, start: int, goal: int) -> list[int]:
         """Vertices of a shortest path, both ends included; empty if there is none."""
         following = self.towards(goal)[1]

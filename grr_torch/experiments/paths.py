@@ -20,11 +20,13 @@ KINDS = ("line_random", "line_self", "circle_random", "circle_out")
 # kinds whose paths end where they began
 CLOSED = ("circle_random", "circle_out")
 
-# the longest diameter of a circle, as a share of the shortest side of the roadmap's bounds
-_DIAMETER = 0.2
+# the largest radius of a circle, as a share of the shortest side of the roadmap's bounds
+_RADIUS = 0.1
+# points of a circle at which it is looked whether it can be reached
+_LOOKED = 24
 # points drawn at once, random starts for each that tell whether it is reachable, and draws before it is given up
-_DRAWN = 2048
-_STARTS = 1
+_DRAWN = {"line": 2048, "circle": 256}
+_STARTS = {"line": 1, "circle": 6}
 _MOST_DRAWS = 200
 
 
@@ -36,8 +38,8 @@ def draw_paths(roadmap: Roadmap, kind: str, paths: int, *, waypoints: int = 200,
 
     - line_random: between two reachable points.
     - line_self: from a reachable point to its mirror image in the robot's base, if that is reachable too.
-    - circle_random: on a diameter between two reachable points, in a random plane.
-    - circle_out: the same with one end of the diameter not reachable.
+    - circle_random: round a reachable point, of a random radius, in a random plane; all of it reachable.
+    - circle_out: the same with a part that is not reachable; it begins on the part that is.
 
     Args:
         roadmap: Whose robot, task space and bounds are meant.
@@ -57,10 +59,10 @@ def draw_paths(roadmap: Roadmap, kind: str, paths: int, *, waypoints: int = 200,
     generator = torch.Generator().manual_seed(check_seed(seed) + KINDS.index(kind))
     found: list[Tensor] = []
     for _ in range(_MOST_DRAWS):
-        start, end = _ends(roadmap, kind, generator)
-        found.append(
-            _line(start, end, waypoints) if kind.startswith("line") else _circle(start, end, waypoints, generator)
-        )
+        if kind in CLOSED:
+            found.append(_circles(roadmap, kind, waypoints, generator))
+        else:
+            found.append(_line(*_ends(roadmap, kind, generator), waypoints))
         if sum(map(len, found)) >= paths:
             return torch.cat(found)[:paths]
     raise ParameterError("kind of path", kind, f"one of which {paths} can be drawn for this roadmap")
@@ -94,32 +96,56 @@ def read_paths(path: str | os.PathLike[str], width: int) -> dict[str, Tensor]:
     return {kind: torch.from_numpy(arrays[kind].copy()) for kind in KINDS if kind in arrays}
 
 
-def _ends(roadmap: Roadmap, kind: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Starts and ends (K, width) of lines, or of the diameters of circles."""
+def _reachable_points(roadmap: Roadmap, shape: str, generator: torch.Generator) -> Tensor:
+    """Random points (K, width) within the bounds that are reachable."""
     low, high = roadmap.points.amin(0), roadmap.points.amax(0)
-    drawn = low + (high - low) * torch.rand(_DRAWN, len(low), dtype=torch.float64, generator=generator)
-    start = drawn[_reachable(roadmap, drawn, generator)]
+    drawn = low + (high - low) * torch.rand(_DRAWN[shape], len(low), dtype=torch.float64, generator=generator)
+    return drawn[_reachable(roadmap, drawn, shape, generator)]
+
+
+def _ends(roadmap: Roadmap, kind: str, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Starts and ends (K, width) of lines."""
+    start = _reachable_points(roadmap, "line", generator)
     if kind == "line_random":
         half = len(start) // 2
         return start[:half], start[half : 2 * half]
-    if kind == "line_self":
-        end, wanted = -start, True
+    kept = _reachable(roadmap, -start, "line", generator)
+    return start[kept], -start[kept]
+
+
+def _circles(roadmap: Roadmap, kind: str, waypoints: int, generator: torch.Generator) -> Tensor:
+    """Circles (K, waypoints, width) round reachable points, in random planes."""
+    centre = _reachable_points(roadmap, "circle", generator)
+    count, d = centre.shape
+    largest = _RADIUS * float((roadmap.points.amax(0) - roadmap.points.amin(0)).min())
+    radius = largest * torch.rand(count, 1, dtype=torch.float64, generator=generator)
+    first = _directions(count, d, generator)
+    if d == 2:
+        second = torch.stack([-first[:, 1], first[:, 0]], dim=1)
     else:
-        length = (
-            _DIAMETER * float((high - low).min()) * torch.rand(len(start), 1, dtype=torch.float64, generator=generator)
-        )
-        end, wanted = start + length * _directions(len(start), len(low), generator), kind == "circle_random"
-    kept = _reachable(roadmap, end, generator) == wanted
-    return start[kept], end[kept]
+        normal = torch.linalg.cross(first, _directions(count, d, generator))
+        second = torch.linalg.cross(normal / normal.norm(dim=1, keepdim=True).clamp_min(1e-12), first)
+
+    def at(angles: Tensor) -> Tensor:
+        """Points (K, A, width) at angles (K, A) or (1, A)."""
+        around = angles.cos()[..., None] * first[:, None] + angles.sin()[..., None] * second[:, None]
+        return centre[:, None] + radius[:, None] * around
+
+    turn = 2.0 * math.pi * torch.arange(_LOOKED, dtype=torch.float64)[None] / _LOOKED
+    looked = at(turn).reshape(-1, d)
+    inside = _reachable(roadmap, looked, "circle", generator).reshape(count, _LOOKED)
+    kept = inside.all(1) if kind == "circle_random" else inside.any(1) & ~inside.all(1)
+    begin = turn[0, inside.double().argmax(1)][:, None]
+    return at(begin + 2.0 * math.pi * torch.linspace(0.0, 1.0, waypoints, dtype=torch.float64))[kept]
 
 
-def _reachable(roadmap: Roadmap, points: Tensor, generator: torch.Generator) -> Tensor:
+def _reachable(roadmap: Roadmap, points: Tensor, shape: str, generator: torch.Generator) -> Tensor:
     """(K,) points that a projection from one of a few random starts reaches."""
-    robot = roadmap.robot
-    targets = points.repeat_interleave(_STARTS, dim=0).to(robot.lower).T.contiguous()
-    guesses = robot.sample(len(points) * _STARTS, generator).T.contiguous()
+    robot, starts = roadmap.robot, _STARTS[shape]
+    targets = points.repeat_interleave(starts, dim=0).to(robot.lower).T.contiguous()
+    guesses = robot.sample(len(points) * starts, generator).T.contiguous()
     valid = project_columns(robot, roadmap.task, targets, guesses, DEFAULT_TOLERANCES)[1]
-    return valid.reshape(-1, _STARTS).any(1).cpu()
+    return valid.reshape(-1, starts).any(1).cpu()
 
 
 def _directions(count: int, d: int, generator: torch.Generator) -> Tensor:
@@ -131,15 +157,3 @@ def _directions(count: int, d: int, generator: torch.Generator) -> Tensor:
 def _line(start: Tensor, end: Tensor, waypoints: int) -> Tensor:
     fractions = torch.linspace(0.0, 1.0, waypoints, dtype=torch.float64)
     return start[:, None] + fractions[:, None] * (end - start)[:, None]
-
-
-def _circle(start: Tensor, end: Tensor, waypoints: int, generator: torch.Generator) -> Tensor:
-    """Circles from start over end back to start: in a plane round the diameter that is drawn too."""
-    centre, radius = 0.5 * (start + end), 0.5 * (start - end)
-    if start.shape[1] == 2:
-        across = torch.stack([-radius[:, 1], radius[:, 0]], dim=1)
-    else:
-        normal = torch.linalg.cross(radius, _directions(len(start), 3, generator))
-        across = torch.linalg.cross(normal / normal.norm(dim=1, keepdim=True).clamp_min(1e-12), radius)
-    angles = torch.linspace(0.0, 2.0 * math.pi, waypoints, dtype=torch.float64)[:, None]
-    return centre[:, None] + angles.cos() * radius[:, None] + angles.sin() * across[:, None]
