@@ -255,3 +255,16 @@ def test_a_robot_in_single_precision_is_solved_for_and_teleoperated(tmp_path, ag
     for target in (points[0], points[1], points[1] * 3.0, points[2]):
         for _ in range(5):
             assert bool(arm.step(target).configuration.isfinite().all())
+
+
+def test_no_arm_stays_on_a_detour_that_leads_nowhere(roadmap):
+    """Near the base's axis edges are connected that lead through long self-motions, and so cannot be followed."""
+    target = torch.tensor([0.0, 0.05, 0.52], dtype=torch.float64)
+    near = roadmap.resolved & ((roadmap.points - target).norm(dim=1) < 0.35)
+    start = roadmap.configurations[near]
+    assert len(start) > 20
+    q, status = _follow(Teleoperator(roadmap, max_step=0.04, start=start), target.expand(260, len(start), 3))
+    still = (q[-10:].diff(dim=0).abs().amax(dim=(0, 2)) < 1e-6).numpy()
+    assert not (still & (status[-1] == "detouring")).any()
+    away = (roadmap.robot.forward_kinematics(q[-1])[0] - target).norm(dim=1)
+    assert float((away < 0.15).double().mean()) > 0.8

@@ -32,6 +32,7 @@ class Arms:
         doubt: (B,) how many these are the next time.
         offsets: (B, n) what the last end of a line differed from its guess by.
         barred: (B, width) the last target that a route led near, without a way on from there; NaN where there is none.
+        avoided: Of each arm, the edges that it could not follow since it last went straight.
     """
 
     q: Tensor
@@ -48,6 +49,7 @@ class Arms:
     doubt: Tensor
     offsets: Tensor
     barred: Tensor
+    avoided: list[frozenset[tuple[int, int]]]
 
     @staticmethod
     def at(follower: Follower, q: Tensor) -> Arms:
@@ -58,7 +60,9 @@ class Arms:
         trust = torch.zeros_like(no_vertex), nothing.clone(), torch.ones_like(no_vertex)
         routes = no_vertex.clone(), last_goal, no_vertex, *trust
         still = torch.zeros_like(q)
-        arms = Arms(q, still, nothing, off, held, q * torch.nan, *routes, still.clone(), nothing.clone())
+        arms = Arms(
+            q, still, nothing, off, held, q * torch.nan, *routes, still.clone(), nothing.clone(), [frozenset()] * len(q)
+        )
         arms.look(follower, torch.arange(len(q)))
         return arms
 
@@ -72,7 +76,7 @@ class Arms:
         self.on_task[which] = turned & robot.within_limits(q) & ~robot.in_self_collision(q)
 
     def barred_from(self, which: Tensor, targets: Tensor, distance: float) -> Tensor:
-        """Whether some arms (A,) are given targets (A, width) within a distance [m] of the one that they are barred from."""
+        """Whether arms (A,) have targets (A, width) within a distance [m] of those that they are barred from: (A,)."""
         return (targets - self.barred[which]).norm(dim=1) <= distance
 
     def forget(self, which: Tensor) -> None:
@@ -80,3 +84,5 @@ class Arms:
         self.held[which] = self.held_q[which] = self.barred[which] = torch.nan
         self.next_vertex[which] = -1
         self.blind[which] = 0
+        for arm in which.tolist():
+            self.avoided[arm] = frozenset()

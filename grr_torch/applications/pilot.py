@@ -165,14 +165,15 @@ class Pilot:
     def _find_ended(self, arms: Arms, which: Tensor, steps: Tensor, targets: Tensor) -> None:
         """Looks for arms (A,) whose next configurations (A, n) are where they stand: their route has come to nothing.
 
-        At a vertex whose next edge cannot be followed, another route is taken from now on. Where there is no way on
-        from the last vertex, the arm is to go as near to its target (A, width) as it can.
+        From a vertex whose next edge cannot be followed, another route is taken. Where there is no way on from the last
+        vertex, the arm is to go as near to its target (A, width) as it can.
         """
         for row in ((steps - arms.q[which]).abs().amax(1) <= _ARRIVED).nonzero()[:, 0].tolist():
             arm = int(which[row])
             here, last = int(arms.next_vertex[arm]), int(arms.last_vertex[arm])
-            if here >= 0 and here != last and (following := int(self.routes.towards(last)[1][here])) >= 0:
-                self.routes.block(here, following)
+            following = -1 if here < 0 else int(self.routes.towards(last, arms.avoided[arm])[1][here])
+            if here != last and following >= 0:
+                arms.avoided[arm] |= {(here, following)}
             else:
                 arms.barred[arm] = targets[row]
             arms.blind[arm] = 0
@@ -201,7 +202,7 @@ class Pilot:
             entries = self.solver.nearest(arms.p[which], _ENTRIES)[1] if fresh and rows else None
             tried: list[tuple[int, int, float, bool]] = []
             for row in rows:
-                cost, following = self.routes.towards(ends[row])
+                cost, following = self.routes.towards(ends[row], arms.avoided[int(which[row])])
                 current = int(arms.next_vertex[which[row]])
                 ahead = _ahead(current, following) if entries is None else entries[row].tolist()
                 on_edge = 0 if fresh else 1 + self._arrived(arms, int(which[row]))

@@ -43,21 +43,24 @@ class Routes:
         self.part: np.ndarray = connected_components(self._graph, directed=False)[1]
         self.towards = lru_cache(_GOALS)(self._towards)
 
-    def _towards(self, goal: int) -> tuple[np.ndarray, np.ndarray]:
+    def _towards(self, goal: int, avoided: frozenset[tuple[int, int]] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
         """Shortest paths to a vertex.
+
+        Args:
+            goal: The vertex.
+            avoided: Pairs of vertices whose edges no path may take.
 
         Returns:
             Lengths (V,) [rad], inf where there is no path, and the next vertex (V,) on it, negative at the goal and
             where there is none.
         """
-        return dijkstra(self._graph, directed=False, indices=goal, return_predecessors=True)
-
-    def block(self, first: int, second: int) -> None:
-        """Leaves an edge out of all paths from now on."""
-        kept = self._graph.tolil()
-        kept[first, second] = kept[second, first] = 0.0
-        self._graph = kept.tocsr()
-        self.towards.cache_clear()
+        graph = self._graph
+        if avoided:
+            rows = graph.tolil()
+            for first, second in avoided:
+                rows[first, second] = rows[second, first] = 0.0
+            graph = rows.tocsr()
+        return dijkstra(graph, directed=False, indices=goal, return_predecessors=True)
 
     def between(self, start: int, goal: int) -> list[int]:
         """Vertices of a shortest path, both ends included; empty if there is none."""
