@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from torch import Tensor
 
-from grr_torch.applications.lines import Follower
+from grr_torch.applications.lines import Follower, norms
+from grr_torch.pieces import Array, Mask
 
 # rotation errors up to so many tolerances are made good on the way; with larger ones an arm is off its task
 _OFF_TASK = 10.0
@@ -35,53 +36,69 @@ class Arms:
         avoided: Of each arm, the edges that it could not follow since it last went straight.
     """
 
-    q: Tensor
-    speed: Tensor
-    p: Tensor
-    on_task: Tensor
-    held: Tensor
-    held_q: Tensor
-    last_vertex: Tensor
-    last_goal: Tensor
-    next_vertex: Tensor
-    blind: Tensor
-    aimed: Tensor
-    doubt: Tensor
-    offsets: Tensor
-    barred: Tensor
+    q: Array
+    speed: Array
+    p: Array
+    on_task: Mask
+    held: Array
+    held_q: Array
+    last_vertex: Array
+    last_goal: Array
+    next_vertex: Array
+    blind: Array
+    aimed: Array
+    doubt: Array
+    offsets: Array
+    barred: Array
     avoided: list[frozenset[tuple[int, int]]]
 
     @staticmethod
-    def at(follower: Follower, q: Tensor) -> Arms:
+    def at(follower: Follower, q: Array) -> Arms:
         """Arms that stand at configurations (B, n)."""
-        nothing = q.new_full((len(q), follower.task.width), torch.nan)
-        off, no_vertex = torch.zeros(len(q), dtype=torch.bool), torch.full((len(q),), -1)
-        held, last_goal = nothing.clone(), nothing.clone()
-        trust = torch.zeros_like(no_vertex), nothing.clone(), torch.ones_like(no_vertex)
-        routes = no_vertex.clone(), last_goal, no_vertex, *trust
-        still = torch.zeros_like(q)
+        count = len(q)
+
+        def unknown(width: int) -> Array:
+            return np.full((count, width), np.nan, q.dtype)
+
+        width, n = follower.task.width, q.shape[1]
         arms = Arms(
-            q, still, nothing, off, held, q * torch.nan, *routes, still.clone(), nothing.clone(), [frozenset()] * len(q)
+            q=q,
+            speed=np.zeros_like(q),
+            p=unknown(width),
+            on_task=np.zeros(count, dtype=bool),
+            held=unknown(width),
+            held_q=unknown(n),
+            last_vertex=np.full(count, -1),
+            last_goal=unknown(width),
+            next_vertex=np.full(count, -1),
+            blind=np.zeros(count, dtype=np.int64),
+            aimed=unknown(width),
+            doubt=np.ones(count, dtype=np.int64),
+            offsets=np.zeros_like(q),
+            barred=unknown(width),
+            avoided=[frozenset()] * count,
         )
-        arms.look(follower, torch.arange(len(q)))
+        arms.look(follower, np.arange(count))
         return arms
 
-    def look(self, follower: Follower, which: Tensor) -> None:
+    def look(self, follower: Follower, which: Array) -> None:
         """Finds out where the tools of some arms (A,) are, and whether these arms are on their task."""
-        robot, task, q = follower.robot, follower.task, self.q[which]
+        robot, task, q = follower.robot, follower.task, torch.from_numpy(self.q[which])
         position, rotation = robot.forward_kinematics(q)
-        self.p[which] = position[:, : task.dimension]
-        error = task.error(self.p[which].T, position.T, rotation.permute(1, 2, 0))
+        points = position[:, : task.dimension]
+        error = task.error(points.T, position.T, rotation.permute(1, 2, 0))
         turned = task.residuals(error)[1] <= _OFF_TASK * follower.tolerances.rotation
-        self.on_task[which] = turned & robot.within_limits(q) & ~robot.in_self_collision(q)
+        self.p[which] = points.numpy()
+        self.on_task[which] = (turned & robot.within_limits(q) & ~robot.in_self_collision(q)).numpy()
 
-    def barred_from(self, which: Tensor, targets: Tensor, distance: float) -> Tensor:
+    def barred_from(self, which: Array, targets: Array, distance: float) -> Mask:
         """Whether arms (A,) have targets (A, width) within a distance [m] of those that they are barred from: (A,)."""
-        return (targets - self.barred[which]).norm(dim=1) <= distance
+        return norms(targets - self.barred[which]) <= distance
 
-    def forget(self, which: Tensor) -> None:
+    def forget(self, which: Array) -> None:
         """Arms (A,) that have no more need of a route or a point to hold at."""
-        self.held[which] = self.held_q[which] = self.barred[which] = torch.nan
+        for nothing in (self.held, self.held_q, self.barred):
+            nothing[which] = np.nan
         self.next_vertex[which] = -1
         self.blind[which] = 0
         for arm in which.tolist():

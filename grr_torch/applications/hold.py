@@ -13,10 +13,10 @@ from grr_torch.spaces.configuration import distance
 
 # metres around the last such point that are searched in a step, and the shares of it that are tried
 _AROUND = 0.2
-_SHARES = (1.0, 0.35, 0.12, 0.03)
+_SHARES = (1.0, 0.2)
 # directions across, in space, and how much they lean to the target
 _SIDES = 6
-_LEANS = (0.5, 0.0, -0.5)
+_LEANS = (0.5, 0.0)
 # a step between neighbouring points may change the configuration by so much a metre [rad/m], and so much in all [rad]
 _SLOPE = 30.0
 _LEAST = 0.05
@@ -57,7 +57,7 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     tried = (left < left[:, :1]) | ~known[:, None]
     tried[:, [0, -1]] = True
     flat = points[tried]
-    guesses, codes = solver.guess(flat.to(torch.float64))
+    guesses, codes = solver.guess(flat.to(torch.float64), certified=False)
     guesses = guesses.to(flat)
     columns, codes = solver.solve_from(
         flat.T.contiguous(), guesses, codes, replace(solver.tolerances, iterations=_ITERATIONS)

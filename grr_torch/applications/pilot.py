@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.hold import nearest_feasible
-from grr_torch.applications.lines import Follower
+from grr_torch.applications.lines import Follower, norms
 from grr_torch.applications.rejoin import rejoin
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
-from grr_torch.spaces.configuration import difference, distance
-
-TRACKING, DETOURING, HOLDING, UNREACHABLE = range(4)
+from grr_torch.applications.steps import HOLDING, TRACKING, UNREACHABLE, Steps
+from grr_torch.pieces import Array, Mask
 
 # vertices that are tried as the first of a route, as its last, and as a way back to the map
 _ENTRIES = 6
@@ -36,125 +34,117 @@ _ARRIVED = 1e-6
 _ON_MAP = 0.05
 
 
-class Steps(NamedTuple):
-    """What A arms do next.
-
-    Attributes:
-        q: (A, n) configurations after the step.
-        goals: (A, n) configurations that the step leads to; NaN where they are not known.
-        points: (A, width) where the tools are then, on their task; NaN where that is to be looked at.
-        codes: (A,) status codes.
-    """
-
-    q: Tensor
-    goals: Tensor
-    points: Tensor
-    codes: Tensor
-
-
 class Pilot:
-    """Decides the next step of arms that are given targets."""
+    """Decides the next step of arms that are given targets. Works on arrays, as `Follower` does."""
 
     def __init__(self, follower: Follower, solver: Solver, routes: Routes) -> None:
         self.follower, self.solver, self.routes = follower, solver, routes
 
-    def steps(self, arms: Arms, which: Tensor, targets: Tensor) -> Steps:
+    def steps(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """The next step of some arms (A,) that are given targets (A, width).
 
         On a route, steps that look for a straight way take turns with such that only follow it: none takes long.
         """
-        unknown = torch.full_like(targets, torch.nan)
-        nowhere = torch.full_like(arms.q[which], torch.nan)
-        steps = Steps(arms.q[which], nowhere, unknown, torch.full((len(which),), DETOURING))
-        left = torch.ones(len(which), dtype=torch.bool)
-        same = (targets - arms.aimed[which]).norm(dim=1) <= _SAME_GOAL
-        blind = same & (arms.blind[which] > 0) & (arms.next_vertex[which] >= 0) & arms.on_task[which]
-        on_way = blind.nonzero()[:, 0]
+        blind = (arms.blind[which] > 0) & (arms.next_vertex[which] >= 0) & arms.on_task[which]
+        if not blind.any():
+            return self._look(arms, which, targets)
+        blind &= norms(targets - arms.aimed[which]) <= _SAME_GOAL
+        steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
+        on_way = blind.nonzero()[0]
         if len(on_way):
             arms.blind[which[on_way]] -= 1
             steps.q[on_way], left[on_way] = self._route(arms, which[on_way])
-        rest = left.nonzero()[:, 0]
-        if len(rest) == len(which):
-            return self._look(arms, which, targets)
+        rest = left.nonzero()[0]
         if len(rest):
-            for part, other in zip(steps, self._look(arms, which[rest], targets[rest]), strict=True):
-                part[rest] = other
+            steps.put(rest, self._look(arms, which[rest], targets[rest]))
         return steps
 
-    def _look(self, arms: Arms, which: Tensor, targets: Tensor) -> Steps:
+    def _look(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """`steps` of arms that look where they can go."""
         # who waits for a target to become feasible looks for a nearer point to hold at, and at the target with it
-        lost = arms.held[which].isfinite().all(1)
-        if bool(lost.any()):
-            lost[lost.clone()] = ~self._hold(arms, which[lost], targets[lost])
-        q, p = arms.q[which], arms.p[which]
-        direct, valid = torch.zeros_like(lost), torch.zeros_like(lost)
-        steps = Steps(q, torch.full_like(q, torch.nan), p, torch.full((len(which),), TRACKING))
-        rows = (~lost).nonzero()[:, 0]
-        if len(rows):
-            guesses, codes = self.solver.guess(targets[rows].to(torch.float64))
-            rows, guesses = rows[codes <= 1], guesses[codes <= 1].to(targets)
-        if len(rows):
-            lines = self.follower.follow(q[rows], p[rows], guesses, targets[rows], arms.offsets[which[rows]])
-            offsets = difference(guesses, lines.ends, self.follower.robot.continuous)
-            fits = offsets.norm(dim=1) <= _OFFSET
-            arms.offsets[which[rows]] = torch.where((lines.converged & fits)[:, None], offsets, 0.0)
-            found = lines.converged & ~lines.collides & self.solver.on_map(lines.ends, guesses)
-            direct[rows] = found & lines.direct & arms.on_task[which[rows]]
-            valid[rows] = direct[rows] | (found & ~arms.barred_from(which[rows], targets[rows], _SAME_GOAL))
-            steps.q[rows], steps.goals[rows], steps.points[rows] = lines.steps, lines.ends, lines.points
-        if bool(direct.all()):
-            arms.forget(which)
-            return steps
+        lost = np.isfinite(arms.held[which]).all(1)
+        if lost.any():
+            lost[lost.copy()] = ~self._hold(arms, which[lost], targets[lost])
+        steps, ends, valid, direct = self._straight(arms, which, targets, ~lost)
         arms.forget(which[direct])
-        fresh = (~valid & ~lost).nonzero()[:, 0]
-        if len(fresh):
+        if direct.all():
+            return steps
+        fresh = ~valid & ~lost
+        if fresh.any():
             self._hold(arms, which[fresh], targets[fresh])
-        rest = (~direct).nonzero()[:, 0]
-        others = self._indirect(arms, which[rest], targets[rest], valid[rest], steps.goals[rest])
-        for part, other in zip(steps, others, strict=True):
-            part[rest] = other
+        rest = ~direct
+        steps.put(rest, self._indirect(arms, which[rest], targets[rest], valid[rest], ends[rest]))
         return steps
 
-    def _hold(self, arms: Arms, which: Tensor, targets: Tensor) -> Tensor:
+    def _straight(self, arms: Arms, which: Array, targets: Array, solvable: Mask) -> tuple[Steps, Array, Mask, Mask]:
+        """Steps straight to targets (A, width), as far as these are solvable (A,).
+
+        Returns:
+            The steps; configurations (A, n) at the targets; which targets (A,) the map has a configuration for; and
+            which arms (A,) can go straight to it.
+        """
+        steps = Steps.none_yet(arms, which)
+        ends = np.full_like(steps.q, np.nan)
+        valid, direct = np.zeros_like(solvable), np.zeros_like(solvable)
+        rows = solvable.nonzero()[0]
+        if len(rows):
+            points = torch.from_numpy(targets[rows].astype(np.float64))
+            guesses, codes = (part.numpy() for part in self.solver.guess(points, certified=False))
+            near = codes <= 1
+            rows, guesses = rows[near], guesses[near].astype(targets.dtype)
+        if len(rows):
+            chosen = which[rows]
+            lines = self.follower.follow(arms.q[chosen], arms.p[chosen], guesses, targets[rows], arms.offsets[chosen])
+            offsets = self.follower.difference(guesses, lines.ends)
+            fits = lines.converged & (norms(offsets) <= _OFFSET)
+            arms.offsets[chosen] = np.where(fits[:, None], offsets, 0.0)
+            found = lines.converged & ~lines.collides
+            found &= self.solver.on_map(torch.from_numpy(lines.ends), torch.from_numpy(guesses)).numpy()
+            free = found & lines.direct & arms.on_task[chosen]
+            direct[rows], valid[rows] = free, free | (found & ~arms.barred_from(chosen, targets[rows], _SAME_GOAL))
+            ends[rows] = lines.ends
+            steps.q[rows[free]], steps.goals[rows[free]] = lines.steps[free], lines.ends[free]
+            steps.points[rows[free]], steps.codes[rows[free]] = lines.points[free], TRACKING
+        return steps, ends, valid, direct
+
+    def _hold(self, arms: Arms, which: Array, targets: Array) -> Mask:
         """Looks for the nearest points to targets (A, width) that arms can hold at; which targets are solvable (A,)."""
-        unset = arms.held[which].isnan().any(1)
-        base = torch.where(unset[:, None], arms.p[which], arms.held[which])
+        unset = np.isnan(arms.held[which]).any(1)
+        base = np.where(unset[:, None], arms.p[which], arms.held[which])
         # what is not to be gone to by any route must not be where a jump leads
         near = unset & arms.barred_from(which, targets, _SAME_GOAL)
-        base_q = torch.where(near[:, None], arms.q[which], arms.held_q[which])
-        arms.held[which], arms.held_q[which], solved = nearest_feasible(self.solver, base, base_q, targets)
+        base_q = np.where(near[:, None], arms.q[which], arms.held_q[which])
+        tensors = (torch.from_numpy(array) for array in (base, base_q, targets))
+        found = nearest_feasible(self.solver, *tensors)
+        arms.held[which], arms.held_q[which], solved = (part.numpy() for part in found)
         return solved
 
-    def _indirect(self, arms: Arms, which: Tensor, targets: Tensor, valid: Tensor, ends: Tensor) -> Steps:
+    def _indirect(self, arms: Arms, which: Array, targets: Array, valid: Mask, ends: Array) -> Steps:
         """`steps` of arms that cannot go straight to their targets.
 
         Those that have a configuration there (`ends`, where `valid`) are on the way to it, others to where they hold.
         """
-        goals, goals_q = targets.clone(), ends.clone()
-        unknown = torch.full_like(goals, torch.nan)
-        codes = torch.full((len(which),), DETOURING)
-        steps = Steps(arms.q[which].clone(), torch.full_like(ends, torch.nan), unknown, codes)
-        left = torch.ones_like(valid)
-        arms.held[which[valid]] = arms.held_q[which[valid]] = torch.nan
-        lost = (~valid).nonzero()[:, 0]
+        goals, goals_q = targets.copy(), ends.copy()
+        steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
+        arms.held[which[valid]], arms.held_q[which[valid]] = np.nan, np.nan
+        lost = (~valid).nonzero()[0]
         if len(lost):
-            goals[lost], goals_q[lost] = arms.held[which[lost]], arms.held_q[which[lost]]
-            lines = self.follower.follow(arms.q[which[lost]], arms.p[which[lost]], goals_q[lost], goals[lost])
-            straight = lines.direct & arms.on_task[which[lost]]
+            chosen = which[lost]
+            goals[lost], goals_q[lost] = arms.held[chosen], arms.held_q[chosen]
+            lines = self.follower.follow(arms.q[chosen], arms.p[chosen], goals_q[lost], goals[lost])
+            straight = lines.direct & arms.on_task[chosen]
             rows = lost[straight]
             arms.next_vertex[which[rows]] = -1
-            steps.q[rows], steps.goals[rows], steps.points[rows] = (
-                part[straight] for part in (lines.steps, lines.ends, lines.points)
-            )
-            steps.codes[rows], left[rows] = UNREACHABLE, False
-        routed = (left & arms.on_task[which]).nonzero()[:, 0]
+            steps.q[rows], steps.goals[rows] = lines.steps[straight], lines.ends[straight]
+            steps.points[rows], steps.codes[rows], left[rows] = lines.points[straight], UNREACHABLE, False
+        routed = (left & arms.on_task[which]).nonzero()[0]
         if len(routed):
-            self._set_goals(arms, which[routed], goals[routed], goals_q[routed])
-            steps.q[routed], left[routed] = self._route(arms, which[routed], looked=True)
-            arms.blind[which[routed]], arms.aimed[which[routed]] = arms.doubt[which[routed]], targets[routed]
-            self._find_ended(arms, which[routed], steps.q[routed], targets[routed])
-        for row in left.nonzero()[:, 0].tolist():
+            chosen = which[routed]
+            self._set_goals(arms, chosen, goals[routed], goals_q[routed])
+            steps.q[routed], left[routed] = self._route(arms, chosen, looked=True)
+            arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[routed]
+            self._find_ended(arms, chosen, steps.q[routed], targets[routed])
+        for row in left.nonzero()[0].tolist():
             step = self._back(arms, int(which[row]), goals_q[row])
             if step is None:
                 steps.codes[row] = HOLDING
@@ -162,13 +152,13 @@ class Pilot:
                 steps.q[row] = step
         return steps
 
-    def _find_ended(self, arms: Arms, which: Tensor, steps: Tensor, targets: Tensor) -> None:
+    def _find_ended(self, arms: Arms, which: Array, steps: Array, targets: Array) -> None:
         """Looks for arms (A,) whose next configurations (A, n) are where they stand: their route has come to nothing.
 
         From a vertex whose next edge cannot be followed, another route is taken. Where there is no way on from the last
         vertex, the arm is to go as near to its target (A, width) as it can.
         """
-        for row in ((steps - arms.q[which]).abs().amax(1) <= _ARRIVED).nonzero()[:, 0].tolist():
+        for row in (np.abs(steps - arms.q[which]).max(1) <= _ARRIVED).nonzero()[0].tolist():
             arm = int(which[row])
             here, last = int(arms.next_vertex[arm]), int(arms.last_vertex[arm])
             following = -1 if here < 0 else int(self.routes.towards(last, arms.avoided[arm])[1][here])
@@ -178,28 +168,28 @@ class Pilot:
                 arms.barred[arm] = targets[row]
             arms.blind[arm] = 0
 
-    def _set_goals(self, arms: Arms, which: Tensor, goals: Tensor, goals_q: Tensor) -> None:
+    def _set_goals(self, arms: Arms, which: Array, goals: Array, goals_q: Array) -> None:
         """Looks for the last vertices of arms' routes again, where the goals (A, width) have moved."""
-        moved = ~((goals - arms.last_goal[which]).norm(dim=1) <= _SAME_GOAL)
+        moved = ~(norms(goals - arms.last_goal[which]) <= _SAME_GOAL)
         # whose straight way to the same goal came to nothing trusts the next one later, lest it goes to and fro
         again = arms.next_vertex[which] < 0
-        longer = torch.where(again, 2 * arms.doubt[which], arms.doubt[which]).clamp_max(_MOST_DOUBT)
-        arms.doubt[which] = torch.where(moved, 1, longer)
-        if bool(moved.any()):
+        longer = np.minimum(np.where(again, 2 * arms.doubt[which], arms.doubt[which]), _MOST_DOUBT)
+        arms.doubt[which] = np.where(moved, 1, longer)
+        if moved.any():
             arms.last_goal[which[moved]] = goals[moved]
-            arms.last_vertex[which[moved]] = torch.tensor(self._last_vertices(goals[moved], goals_q[moved]))
+            arms.last_vertex[which[moved]] = self._last_vertices(goals[moved], goals_q[moved])
 
-    def _route(self, arms: Arms, which: Tensor, looked: bool = False) -> tuple[Tensor, Tensor]:
+    def _route(self, arms: Arms, which: Array, looked: bool = False) -> tuple[Array, Mask]:
         """Steps (A, n) of arms on shortest paths to their last vertices, and which found no way (A,).
 
         Arms that have `looked` round in this step go on to the next vertex; others try to leave some out.
         """
-        result, left = arms.q[which].clone(), torch.ones(len(which), dtype=torch.bool)
+        result, left = arms.q[which].copy(), np.ones(len(which), dtype=bool)
         ends = arms.last_vertex[which].tolist()
         for fresh in (False, True):
             # where the next vertex of a route cannot be gone to any more, a new way in is looked for
-            rows = (left & ((arms.next_vertex[which] >= 0) | fresh)).nonzero()[:, 0].tolist()
-            entries = self.solver.nearest(arms.p[which], _ENTRIES)[1] if fresh and rows else None
+            rows = (left & ((arms.next_vertex[which] >= 0) | fresh)).nonzero()[0].tolist()
+            entries = self._nearest(arms.p[which], _ENTRIES) if fresh and rows else None
             tried: list[tuple[int, int, float, bool]] = []
             for row in rows:
                 cost, following = self.routes.towards(ends[row], arms.avoided[int(which[row])])
@@ -215,11 +205,10 @@ class Pilot:
 
     def _arrived(self, arms: Arms, arm: int) -> bool:
         """Whether an arm is at the vertex that its route led to."""
-        there = self.solver.configurations[arms.next_vertex[arm]].to(arms.q)
-        return bool(distance(arms.q[arm], there, self.follower.robot.continuous) < _ARRIVED)
+        return bool(self.follower.distance(arms.q[arm], self._placed[arms.next_vertex[arm]]) < _ARRIVED)
 
     def _enter(
-        self, arms: Arms, which: Tensor, result: Tensor, left: Tensor, tried: list[tuple[int, int, float, bool]]
+        self, arms: Arms, which: Array, result: Array, left: Mask, tried: list[tuple[int, int, float, bool]]
     ) -> None:
         """Sends arms (A,) to that of their vertices from which the way is shortest, if one can be gone to.
 
@@ -231,48 +220,61 @@ class Pilot:
             tried: Row in `which`, vertex, length of the way from there, and whether the arm is on an edge that leads
                 there, which is known to be continuous.
         """
-        owner, vertex = torch.tensor([item[0] for item in tried]), torch.tensor([item[1] for item in tried])
+        owner, vertex, lengths, on_edge = (np.array(part) for part in zip(*tried, strict=True))
         q, p = arms.q[which[owner]], arms.p[which[owner]]
-        placed, points = self.solver.configurations[vertex], self.solver.points[vertex]
+        placed, points = self._placed[vertex], self._points[vertex]
         lines = self.follower.follow(q, p, placed, points)
-        passable = lines.direct | (lines.safe & torch.tensor([item[3] for item in tried]))
-        total = q.new_tensor([item[2] for item in tried]) + distance(q, placed, self.follower.robot.continuous)
-        total = torch.where(passable, total, torch.inf)
-        for row in dict.fromkeys(item[0] for item in tried):
-            mine = (owner == row).nonzero()[:, 0]
+        total = np.where(lines.direct | (lines.safe & on_edge), lengths + self.follower.distance(q, placed), np.inf)
+        for row in dict.fromkeys(owner.tolist()):
+            mine = (owner == row).nonzero()[0]
             # of equal ways, the one that leads on
-            best = mine[len(mine) - 1 - total[mine].flip(0).argmin()]
-            if bool(total[best] < torch.inf):
+            best = mine[len(mine) - 1 - total[mine][::-1].argmin()]
+            if total[best] < np.inf:
                 result[row], left[row] = lines.steps[best], False
                 arms.next_vertex[which[row]] = vertex[best]
 
-    def _last_vertices(self, goals: Tensor, goals_q: Tensor) -> list[int]:
+    def _last_vertices(self, goals: Array, goals_q: Array) -> Array:
         """Of the vertices round each goal that it is joined to by a continuous line, the one most like it.
 
         Of all of them, where there is no such line.
         """
-        vertices = self.solver.nearest(goals, _ENDS)[1]
-        placed = self.solver.configurations[vertices].to(goals_q)
-        apart = distance(placed, goals_q[:, None], self.follower.robot.continuous)
+        vertices = self._nearest(goals, _ENDS)
+        placed = self._placed[vertices]
+        apart = self.follower.distance(placed, goals_q[:, None])
         count = vertices.shape[1]
         lines = self.follower.follow(
-            goals_q.repeat_interleave(count, 0),
-            goals.repeat_interleave(count, 0),
+            goals_q.repeat(count, 0),
+            goals.repeat(count, 0),
             placed.reshape(-1, placed.shape[2]),
-            self.solver.points[vertices].to(goals).reshape(-1, goals.shape[1]),
+            self._points[vertices].reshape(-1, goals.shape[1]),
         )
-        apart += torch.where(lines.direct.reshape(apart.shape), 0.0, _NOT_JOINED)
-        return vertices.gather(1, apart.argmin(1)[:, None])[:, 0].tolist()
+        apart += np.where(lines.direct.reshape(apart.shape), 0.0, _NOT_JOINED)
+        return vertices[np.arange(len(vertices)), apart.argmin(1)]
 
-    def _back(self, arms: Arms, arm: int, goal_q: Tensor) -> Tensor | None:
+    def _back(self, arms: Arms, arm: int, goal_q: Array) -> Array | None:
         """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near."""
         arms.next_vertex[arm] = -1
-        vertices = self.solver.nearest(arms.p[arm][None], _WAYS_BACK)[1][0]
-        ends = self.solver.configurations[vertices].to(goal_q)
-        here = self.solver.solve_columns(arms.p[arm][:, None])[0].T
-        if not bool(distance(here, arms.q[arm], self.follower.robot.continuous) <= _ON_MAP):
-            ends = torch.cat([goal_q[None], here, ends])
-        return rejoin(self.follower, arms.q[arm], ends[ends.isfinite().all(1)])
+        ends = self._placed[self._nearest(arms.p[arm][None], _WAYS_BACK)[0]]
+        here = self.solver.solve_columns(torch.from_numpy(arms.p[arm][:, None]))[0].T.numpy()
+        if not self.follower.distance(here, arms.q[arm])[0] <= _ON_MAP:
+            ends = np.concatenate([goal_q[None], here, ends])
+        ends = ends[np.isfinite(ends).all(1)]
+        step = rejoin(self.follower, torch.from_numpy(arms.q[arm]), torch.from_numpy(ends))
+        return None if step is None else step.numpy()
+
+    def _nearest(self, points: Array, count: int) -> Array:
+        """(A, count) resolved vertices nearest to points (A, width)."""
+        return self.solver.nearest(torch.from_numpy(points), count)[1].numpy()
+
+    @cached_property
+    def _placed(self) -> Array:
+        """(V, n) configurations of the vertices."""
+        return self.solver.configurations.numpy()
+
+    @cached_property
+    def _points(self) -> Array:
+        """(V, width) points of the vertices."""
+        return self.solver.points.numpy()
 
 
 def _ahead(vertex: int, following: np.ndarray) -> list[int]:

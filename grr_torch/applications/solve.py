@@ -141,10 +141,11 @@ class Solver:
         q[:, near[~hit]] = solved[:, ~hit]
         return q, codes
 
-    def guess(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def guess(self, points: Tensor, *, certified: bool = True) -> tuple[Tensor, Tensor]:
         """Averages (N, n) for points (N, width) on the CPU, and what is known of the points so far (N,).
 
-        2n multiply-adds a neighbour, and k³ a doubling of the paths by which connected vertices are found.
+        2n multiply-adds a neighbour, and k³ a doubling of the paths by which connected vertices are found. Whether the
+        points' cells are certified is looked up only if asked for.
         """
         positions = points[:, : self.task.dimension].numpy()
         nearest, weights, near = self._around.weigh(points)
@@ -153,7 +154,8 @@ class Solver:
             torch.from_numpy(nearest), self._embedded, per_sample_weights=torch.from_numpy(weights), mode="sum"
         )
         codes = np.full(len(points), _SOLVED, dtype=np.uint8)
-        self._mark_uncertified(codes, positions, nearest[:, 0])
+        if certified:
+            self._mark_uncertified(codes, positions, nearest[:, 0])
         codes[~near | ~(weights.sum(1) > 0.0)] = _TOO_FAR
         codes[((positions < self._low) | (positions > self._high)).any(1)] = _OUTSIDE
         return average(sums, self._continuous), torch.from_numpy(codes)

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.braking import limit_acceleration
-from grr_torch.applications.lines import Follower
-from grr_torch.applications.pilot import HOLDING, Pilot
+from grr_torch.applications.lines import Follower, norms
+from grr_torch.applications.pilot import Pilot
 from grr_torch.applications.retime import per_joint, usual_speeds
 from grr_torch.applications.routes import Routes
+from grr_torch.applications.steps import HOLDING
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import one_thread
+from grr_torch.pieces import Array, Mask, one_thread
 from grr_torch.projection.project import Tolerances
 from grr_torch.spaces.task import TaskSpace
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 # of projections along lines, whose guesses are near; what takes longer is not to be gone to in a control step
 _ITERATIONS = 6
-# what a status says, by the pilot's codes
+# what a status says, by the codes of steps
 STATUSES = np.array(["tracking", "detouring", "holding", "unreachable"])
 
 
@@ -124,7 +125,7 @@ class Teleoperator:
     @property
     def configuration(self) -> Tensor | None:
         """(*batch, n) where the arms are, as last commanded or reset; None before the first target where none is."""
-        return None if self._arms is None else self._arms.q.reshape(*self._batch, -1).clone()
+        return None if self._arms is None else torch.from_numpy(self._arms.q.reshape(*self._batch, -1).copy())
 
     def reset(self, configuration: Tensor | None = None) -> None:
         """Starts anew: the next target is taken wherever it is, and no input is too old.
@@ -140,10 +141,10 @@ class Teleoperator:
             q = robot.columns(configuration).T
             if not bool(q.isfinite().all()):
                 raise ParameterError("configuration", "NaN or infinite values", "finite values")
-            self._batch, self._arms = configuration.shape[:-1], Arms.at(self._follower, q.clone())
+            self._batch, self._arms = configuration.shape[:-1], Arms.at(self._follower, q.numpy().copy())
         elif self._arms is not None:
             self._arms = Arms.at(self._follower, self._arms.q)
-        self._last: Tensor | None = None
+        self._last: Array | None = None
         self._now, self._freshest = 0.0, math.inf
 
     def step(self, target: Tensor, time: float | None = None) -> Command:
@@ -168,45 +169,45 @@ class Teleoperator:
             raise ParameterError("target", given, f"a tensor of shape (*batch, {task.width})")
         if self._arms is not None and target.shape[:-1] != self._batch:
             raise ParameterError("target shape", tuple(target.shape), f"{(*self._batch, task.width)}: one for each arm")
-        targets = target.detach().to(robot.lower).reshape(-1, task.width)
+        targets = target.detach().to(robot.lower).reshape(-1, task.width).numpy().copy()
         with torch.no_grad(), one_thread():
-            accepted = targets.isfinite().all(1) & self._in_time(time)
+            accepted = np.isfinite(targets).all(1) & self._in_time(time)
             if self._arms is None:
                 self._start(target.shape[:-1], targets)
             if self._last is not None:
                 # comparison with NaN, where there was no target yet, is false
-                accepted &= ~((targets - self._last).norm(dim=1) > self.max_jump)
-                targets = torch.where(accepted[:, None], targets, self._last)
-            self._last = torch.where(accepted[:, None], targets, torch.nan) if self._last is None else targets
+                accepted &= ~(norms(targets - self._last) > self.max_jump)
+                targets = np.where(accepted[:, None], targets, self._last)
+            self._last = np.where(accepted[:, None], targets, np.nan) if self._last is None else targets
             return self._advance(accepted, targets)
 
-    def _advance(self, accepted: Tensor, targets: Tensor) -> Command:
+    def _advance(self, accepted: Mask, targets: Array) -> Command:
         arms = self._arms
         assert arms is not None
-        q, goals, codes = arms.q.clone(), arms.q.clone(), torch.full((len(targets),), HOLDING)
-        points = arms.p.clone()
-        which = accepted.nonzero()[:, 0]
+        q, goals, points = arms.q.copy(), arms.q.copy(), arms.p.copy()
+        codes = np.full(len(targets), HOLDING)
+        which = accepted.nonzero()[0]
         if len(which):
             q[which], goals[which], points[which], codes[which] = self._pilot.steps(arms, which, targets[which])
         if self._gain is not None:
-            arms.speed = limit_acceleration(self._follower, self._gain, arms.q, arms.speed, q, goals)
-            q = arms.q + arms.speed
-            points = torch.full_like(points, torch.nan)
+            moving = (torch.from_numpy(array) for array in (arms.q, arms.speed, q, goals))
+            arms.speed = limit_acceleration(self._follower, self._gain, *moving).numpy()
+            q, points = arms.q + arms.speed, np.full_like(points, np.nan)
         arms.q, arms.p = q, points
-        unknown = points.isnan().any(1).nonzero()[:, 0]
+        unknown = np.isnan(points).any(1).nonzero()[0]
         if len(unknown):
             arms.look(self._follower, unknown)
-        return Command(q.reshape(*self._batch, -1).clone(), STATUSES[codes.numpy()].reshape(self._batch))
+        return Command(torch.from_numpy(q.reshape(*self._batch, -1).copy()), STATUSES[codes].reshape(self._batch))
 
-    def _start(self, batch: torch.Size, targets: Tensor) -> None:
+    def _start(self, batch: torch.Size, targets: Array) -> None:
         """Arms at their first targets."""
-        if not bool(targets.isfinite().all()):
+        if not np.isfinite(targets).all():
             raise ParameterError("first target", "NaN or infinite values", "finite values: the arms start there")
-        solver = self.roadmap.solver
-        q, codes = solver.solve_columns(targets.T.contiguous())
-        vertices = solver.nearest(targets.cpu())[1][:, 0]
-        placed = torch.where((codes <= 1).to(q.device)[:, None], q.T, solver.configurations[vertices].to(q))
-        self._batch, self._arms = batch, Arms.at(self._follower, placed)
+        solver, points = self.roadmap.solver, torch.from_numpy(targets)
+        q, codes = solver.solve_columns(points.T.contiguous())
+        vertices = solver.nearest(points)[1][:, 0]
+        placed = torch.where((codes <= 1)[:, None], q.T, solver.configurations[vertices])
+        self._batch, self._arms = batch, Arms.at(self._follower, placed.numpy())
 
     def _in_time(self, time: float | None) -> bool:
         """Whether an input is younger than the time-out; the control clock advances."""

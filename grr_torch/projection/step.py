@@ -66,9 +66,7 @@ class Limits(NamedTuple):
     @classmethod
     def of(cls, robot: Robot) -> Limits | None:
         """Those of a robot; None where no joint has any."""
-        if bool(robot.lower.isinf().all() & robot.upper.isinf().all()):
-            return None
-        return cls(robot.lower[:, None], robot.upper[:, None])
+        return cls(robot.lower[:, None], robot.upper[:, None]) if robot.has_limits else None
 
 
 def free_step(equations: Equations) -> Tensor:

@@ -23,11 +23,14 @@ class FewKinematics:
         self._joints = tree.joints
         self._parents = [joint.parent for joint in tree.joints]
         self._dofs = np.array([joint.dof for joint in tree.joints], dtype=np.int64)
-        # rows z, origin, x, y, x
-        self._mounts = [np.ascontiguousarray(mount.numpy()[[2, 3, 0, 1, 0]]) for mount in tree.mounts]
+        mounts = [mount.numpy() for mount in tree.mounts]
+        # what cos q, sin q, 1 and q make of a joint's frame in its parent's
+        self._terms = np.stack(
+            [_terms(mount, joint.revolute) for mount, joint in zip(mounts, tree.joints, strict=True)]
+        )
         self._tool, tool = tree.links[tree.tool]
         self._tool_mount = tool.numpy()
-        self._base = np.eye(4, 3)[:, :, None]
+        self._base = np.eye(4, 3)
         self._path = list(tree.path)
         self._slides = [index for index, joint in enumerate(tree.joints) if not joint.revolute]
         figures = np.array([(joint.multiplier, joint.offset) for joint in tree.joints])
@@ -45,34 +48,21 @@ class FewKinematics:
 
     def frames(self, q: Array) -> Array:
         """`KinematicTree.frames`: poses (F, 4, 3, N) for configurations q (n, N)."""
-        count, width = len(self._joints), q.shape[1]
         values = q[self._dofs]
         if self._mimic is not None:
             values = (values * self._mimic[0] + self._mimic[1]).astype(q.dtype)
-        cosines = np.cos(values)
-        sines = np.empty((count, 2, 1, width), q.dtype)
-        np.sin(values, out=sines[:, 0, 0])
-        np.negative(sines[:, 0], out=sines[:, 1])
-        size = 3 * width
-        memory = np.empty((count + 2) * 4 * size, q.dtype)
-        frames = memory.reshape(count + 2, 4, 3, width)
-        whole = memory.reshape(count + 2, 4, size)
+        count, width = values.shape
+        factors = np.ones((count, width, 4), q.dtype)
+        np.cos(values, out=factors[..., 0])
+        np.sin(values, out=factors[..., 1])
+        factors[..., 3] = values
+        local = np.matmul(factors, self._terms).reshape(count, width, 4, 4)
+        frames = np.empty((count + 2, width, 4, 3), q.dtype)
         frames[-1] = self._base
-        for index, (parent, mount) in enumerate(zip(self._parents, self._mounts, strict=True)):
-            # z and origin in their place, what has yet to be turned behind them, where the next frame comes to lie
-            start = (4 * index + 2) * size
-            rows = memory[start : start + 5 * size].reshape(5, size)
-            np.matmul(mount, whole[parent], out=rows)
-            turned, placed = frames[index, :2], rows.reshape(5, 3, width)
-            if self._joints[index].revolute:
-                # x' = c·x + s·y and y' = c·y − s·x, both at once
-                np.multiply(placed[2:4], cosines[index], out=turned)
-                turned += placed[3:5] * sines[index]
-            else:
-                turned[...] = placed[2:4]
-                frames[index, 3] += frames[index, 2] * values[index]
-        np.matmul(self._tool_mount, whole[self._tool], out=whole[-2])
-        return frames
+        for index, parent in enumerate(self._parents):
+            np.matmul(local[index], frames[parent], out=frames[index])
+        np.matmul(self._tool_mount, frames[self._tool], out=frames[-2])
+        return np.ascontiguousarray(frames.transpose(0, 2, 3, 1))
 
     def jacobian(self, frames: Array) -> Array:
         """`KinematicTree.jacobian`: (6, n, N) from frames (F, 4, 3, N)."""
@@ -92,3 +82,17 @@ class FewKinematics:
             return rows
         # ∂/∂q sums over the joints that q drives
         return np.matmul(self._drive, rows).astype(frames.dtype)
+
+
+def _terms(mount: Array, revolute: bool) -> Array:
+    """(4, 16) rows of a joint's frame (4, 4), its axes and its origin, that go with cos q, sin q, 1 and q."""
+    terms = np.zeros((4, 4, 4), mount.dtype)
+    x, y, z, origin = mount
+    if revolute:
+        terms[0, :2] = x, y
+        terms[1, :2] = y, -x
+        terms[2, 2:] = z, origin
+    else:
+        terms[2] = mount
+        terms[3, 3] = z
+    return terms.reshape(4, 16)

@@ -83,6 +83,11 @@ class Robot:
         return self.lower.device
 
     @cached_property
+    def has_limits(self) -> bool:
+        """Whether any joint has position limits."""
+        return not bool(self.lower.isinf().all() & self.upper.isinf().all())
+
+    @cached_property
     def chain(self) -> SerialChain:
         """The chain as a `pytorch_kinematics.SerialChain`, in which mimic joints are degrees of freedom.
 

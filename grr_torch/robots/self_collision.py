@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from grr_torch.pieces import are_few
+from grr_torch.robots.few_self_collision import FewSpheres
 from grr_torch.robots.kinematics import KinematicTree, place
 from grr_torch.robots.spheres import Sphere, SphereModel
 
@@ -115,6 +118,8 @@ class SphereKernel:
 
     def collides(self, frames: Tensor, margin: float) -> Tensor:
         """Whether any checked pair of links is nearer than `margin` [m]: (N,) bool; true where a frame is NaN."""
+        if are_few(frames):
+            return torch.from_numpy(self._few.collides(frames.detach().numpy(), margin))
         near = ~(self._squared(frames, self.bounds) >= (self.bound_reach + margin).square())
         hit = torch.zeros(frames.shape[3], dtype=torch.bool, device=frames.device)
         if not bool(near.any()):
@@ -124,6 +129,10 @@ class SphereKernel:
             for part, squared in pair.squared_distances(relative):
                 hit[chosen[part]] |= ~(squared >= limit).flatten(0, 1).all(0)
         return hit
+
+    @cached_property
+    def _few(self) -> FewSpheres:
+        return FewSpheres(self)
 
     def _squared(self, frames: Tensor, points: Tensor) -> Tensor:
         """(P, N) squared distances of one point (L, 1, 4) of each link. 25 multiply-adds a link, 3 a pair."""
