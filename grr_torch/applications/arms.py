@@ -91,6 +91,10 @@ class Arms:
         self.p[which] = points.numpy()
         self.on_task[which] = (turned & robot.within_limits(q) & ~robot.in_self_collision(q)).numpy()
 
+    def holds(self, which: Array) -> Mask:
+        """Whether arms (A,) have a point to hold at: (A,)."""
+        return norms(self.held[which]) < np.inf
+
     def barred_from(self, which: Array, targets: Array, distance: float) -> Mask:
         """Whether arms (A,) have targets (A, width) within a distance [m] of those that they are barred from: (A,)."""
         return norms(targets - self.barred[which]) <= distance

@@ -176,13 +176,13 @@ class Follower:
     def _bridged(self, chain: Array, points: Array, wide: Mask) -> Mask:
         """Lines (B,) that are continuous where neighbouring points (B, K + 1, …) of them are far apart (B, K)."""
         rows, columns = wide.nonzero()
-        pairs = [
-            tuple(torch.from_numpy(np.ascontiguousarray(part[rows, columns + end].T)) for end in (0, 1))
-            for part in (points, chain)
-        ]
-        joined = continuous_columns(
-            self.robot, self.task, pairs[0], pairs[1], 0.5 * math.sqrt(self.robot.n), self.epsilon, self.tolerances
-        )
+
+        def ends(part: Array) -> tuple[Tensor, Tensor]:
+            first, second = (np.ascontiguousarray(part[rows, columns + end].T) for end in (0, 1))
+            return torch.from_numpy(first), torch.from_numpy(second)
+
+        c, epsilon = 0.5 * math.sqrt(self.robot.n), self.epsilon
+        joined = continuous_columns(self.robot, self.task, ends(points), ends(chain), c, epsilon, self.tolerances)
         result = np.ones(len(chain), dtype=bool)
         result[rows[~joined.numpy()]] = False
         return result

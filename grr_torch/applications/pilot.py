@@ -62,7 +62,7 @@ class Pilot:
     def _look(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """`steps` of arms that look where they can go."""
         # who waits for a target to become feasible looks for a nearer point to hold at, and at the target with it
-        lost = np.isfinite(arms.held[which]).all(1)
+        lost = arms.holds(which)
         if lost.any():
             lost[lost.copy()] = ~self._hold(arms, which[lost], targets[lost])
         steps, ends, valid, direct = self._straight(arms, which, targets, ~lost)
@@ -109,7 +109,7 @@ class Pilot:
 
     def _hold(self, arms: Arms, which: Array, targets: Array) -> Mask:
         """Looks for the nearest points to targets (A, width) that arms can hold at; which targets are solvable (A,)."""
-        unset = np.isnan(arms.held[which]).any(1)
+        unset = ~arms.holds(which)
         base = np.where(unset[:, None], arms.p[which], arms.held[which])
         # what is not to be gone to by any route must not be where a jump leads
         near = unset & arms.barred_from(which, targets, _SAME_GOAL)

@@ -171,7 +171,7 @@ class Teleoperator:
             raise ParameterError("target shape", tuple(target.shape), f"{(*self._batch, task.width)}: one for each arm")
         targets = target.detach().to(robot.lower).reshape(-1, task.width).numpy().copy()
         with torch.no_grad(), one_thread():
-            accepted = np.isfinite(targets).all(1) & self._in_time(time)
+            accepted: Mask = np.isfinite(targets).all(1) & self._in_time(time)
             if self._arms is None:
                 self._start(target.shape[:-1], targets)
             if self._last is not None:
@@ -194,7 +194,7 @@ class Teleoperator:
             arms.speed = limit_acceleration(self._follower, self._gain, *moving).numpy()
             q, points = arms.q + arms.speed, np.full_like(points, np.nan)
         arms.q, arms.p = q, points
-        unknown = np.isnan(points).any(1).nonzero()[0]
+        unknown = (~(norms(points) < np.inf)).nonzero()[0]
         if len(unknown):
             arms.look(self._follower, unknown)
         return Command(torch.from_numpy(q.reshape(*self._batch, -1).copy()), STATUSES[codes].reshape(self._batch))
