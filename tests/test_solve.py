@@ -161,3 +161,11 @@ def test_a_roadmap_without_a_resolved_vertex_is_refused(planar_roadmap):
     )
     with pytest.raises(ParameterError, match="resolved vertex"):
         empty.solve(torch.zeros(2, dtype=torch.float64))
+
+
+@pytest.mark.filterwarnings("error")
+def test_points_beyond_all_numbers_are_outside(planar_roadmap):
+    points = torch.tensor([[1e300, 0.0], [1e200, 1e308], [-1e154, 1e154]], dtype=torch.float64)
+    solution = planar_roadmap.solve(points)
+    assert solution.status.tolist() == ["outside"] * 3
+    assert not bool(solution.valid.any())

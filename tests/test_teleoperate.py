@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import grr_torch
+from grr_torch.applications.routes import Routes
 from grr_torch.applications.teleoperate import STATUSES, Teleoperator
 from grr_torch.errors import ParameterError
 
@@ -268,3 +269,28 @@ def test_no_arm_stays_on_a_detour_that_leads_nowhere(roadmap):
     assert not (still & (status[-1] == "detouring")).any()
     away = (roadmap.robot.forward_kinematics(q[-1])[0] - target).norm(dim=1)
     assert float((away < 0.15).double().mean()) > 0.8
+
+
+def test_routes_leave_out_the_edges_that_are_avoided(roadmap):
+    routes = Routes(roadmap)
+    goal, start = _vertices(roadmap, 2, 17).tolist()
+    cost, following = routes.towards(goal)
+    avoided: frozenset[tuple[int, int]] = frozenset()
+    for _ in range(3):
+        avoided |= {(start, int(following[start]))}
+        longer, following = routes.towards(goal, avoided)
+        assert (start, int(following[start])) not in avoided
+        assert longer[start] >= cost[start]
+        assert (longer >= cost - 1e-12).all()
+        cost = longer
+    assert routes.towards(goal)[0][start] < cost[start], "others still take them"
+
+
+@pytest.mark.filterwarnings("error")
+def test_targets_beyond_all_numbers_are_only_far_away(roadmap):
+    start = roadmap.configurations[_vertices(roadmap, 1)]
+    teleoperator = Teleoperator(roadmap, start=start)
+    for _ in range(5):
+        command = teleoperator.step(torch.full((1, 3), 1e300, dtype=torch.float64))
+    assert bool(command.configuration.isfinite().all())
+    assert command.status[0] in ("unreachable", "detouring", "holding")

@@ -50,7 +50,11 @@ class Around:
         # the one after the k-th is at infinity where there is none
         distances, nearest = self._tree.query(places, k + 1, workers=-1 if len(points) > _MANY else 1)
         weights = _weights(distances, k, _FARTHEST * self._radius)
-        return nearest[:, :k], weights, distances[:, 0] <= self._radius
+        return self._ranks(nearest[:, :k]), weights, distances[:, 0] <= self._radius
+
+    def _ranks(self, nearest: Array) -> Array:
+        """Ranks that there are: from a point beyond all numbers the tree finds none."""
+        return np.minimum(nearest, self._count - 1)
 
     def within(self, places: Array, radius: float) -> Array:
         """Lists of the ranks of vertices within a radius [m] of places (N, d)."""
@@ -59,7 +63,7 @@ class Around:
     def nearest(self, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """The k nearest: distances (N, k) [m] and ranks (N, k)."""
         distances, index = self._tree.query(points[:, : self._d].numpy(), k=range(1, min(k, self._count) + 1))
-        return torch.from_numpy(distances), torch.from_numpy(index)
+        return torch.from_numpy(distances), torch.from_numpy(self._ranks(index))
 
 
 class AroundProduct:

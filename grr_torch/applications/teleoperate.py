@@ -170,7 +170,8 @@ class Teleoperator:
         if self._arms is not None and target.shape[:-1] != self._batch:
             raise ParameterError("target shape", tuple(target.shape), f"{(*self._batch, task.width)}: one for each arm")
         targets = target.detach().to(robot.lower).reshape(-1, task.width).numpy().copy()
-        with torch.no_grad(), one_thread():
+        # targets beyond all numbers are only far away
+        with torch.no_grad(), one_thread(), np.errstate(over="ignore", invalid="ignore"):
             accepted: Mask = np.isfinite(targets).all(1) & self._in_time(time)
             if self._arms is None:
                 self._start(target.shape[:-1], targets)
