@@ -141,6 +141,8 @@ class Solver:
         q[:, near[~hit]] = solved[:, ~hit]
         return q, codes
 
+    # points beyond all numbers are outside
+    @np.errstate(over="ignore", invalid="ignore")
     def guess(self, points: Tensor, *, certified: bool = True) -> tuple[Tensor, Tensor]:
         """Averages (N, n) for points (N, width) on the CPU, and what is known of the points so far (N,).
 
