@@ -24,6 +24,8 @@ _WAYS_BACK = 32
 _SAME_GOAL = 0.03
 # the most steps for which an arm on a route does not look for a straight way
 _MOST_DOUBT = 32
+# edges that an arm avoids before it gives a goal up
+_MOST_AVOIDED = 8
 # the most that a guess is expected to be off by [rad]
 _OFFSET = 0.3
 # more than any distance of configurations [rad]
@@ -162,7 +164,7 @@ class Pilot:
             arm = int(which[row])
             here, last = int(arms.next_vertex[arm]), int(arms.last_vertex[arm])
             following = -1 if here < 0 else int(self.routes.towards(last, arms.avoided[arm])[1][here])
-            if here != last and following >= 0:
+            if here != last and following >= 0 and len(arms.avoided[arm]) < _MOST_AVOIDED:
                 arms.avoided[arm] |= {(here, following)}
             else:
                 arms.barred[arm] = targets[row]

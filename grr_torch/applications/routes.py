@@ -56,10 +56,11 @@ class Routes:
         """
         graph = self._graph
         if avoided:
-            rows = graph.tolil()
-            for first, second in avoided:
-                rows[first, second] = rows[second, first] = 0.0
-            graph = rows.tocsr()
+            lengths = graph.data.copy()
+            for pair in avoided:
+                row = slice(*graph.indptr[min(pair) : min(pair) + 2])
+                lengths[row][graph.indices[row] == max(pair)] = np.inf
+            graph = csr_matrix((lengths, graph.indices, graph.indptr), shape=graph.shape)
         return dijkstra(graph, directed=False, indices=goal, return_predecessors=True)
 
     def between(self, start: int, goal: int) -> list[int]:
