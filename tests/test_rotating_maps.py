@@ -188,3 +188,10 @@ def test_seeds_far_from_every_orientation_are_named(kinova):
     task = Yaw(3, rpy=(math.pi, 0.0, 0.0))
     with pytest.raises((SeedError, ParameterError)):
         grr_torch.build(kinova, task, points=product_graph(task, places, 2), seeds=[[0.0] * 7], refine=False)
+
+
+def test_points_beyond_all_numbers_are_outside_at_every_rotation(planar_5):
+    roadmap = grr_torch.build(planar_5, "pose", points=100, refine=False)
+    yaws = roadmap.points[:, 2].unique()
+    far = torch.stack([torch.full_like(yaws, 1e300), torch.zeros_like(yaws), yaws], dim=1)
+    assert set(roadmap.solve(far).status.tolist()) == {"outside"}

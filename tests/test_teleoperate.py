@@ -294,3 +294,12 @@ def test_targets_beyond_all_numbers_are_only_far_away(roadmap):
         command = teleoperator.step(torch.full((1, 3), 1e300, dtype=torch.float64))
     assert bool(command.configuration.isfinite().all())
     assert command.status[0] in ("unreachable", "detouring", "holding")
+
+
+def test_no_arms_are_no_error_and_starts_may_have_gradients(roadmap):
+    nobody = Teleoperator(roadmap, start=torch.zeros(0, 7, dtype=torch.float64))
+    command = nobody.step(torch.zeros(0, 3, dtype=torch.float64))
+    assert command.configuration.shape == (0, 7)
+    assert command.status.shape == (0,)
+    start = roadmap.configurations[_vertices(roadmap, 1)].requires_grad_()
+    assert not Teleoperator(roadmap, start=start).step(torch.zeros(1, 3)).configuration.requires_grad

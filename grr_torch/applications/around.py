@@ -86,7 +86,8 @@ class AroundProduct:
         d, size = self._task.dimension, len(self._graph.positions.points)
         k = min(_PLACES[d], size)
         distances, near = self._tree.query(points[:, :d].numpy(), k + 1)
-        places = torch.from_numpy(near[:, :k])
+        # from a point beyond all numbers the tree finds none
+        places = torch.from_numpy(np.minimum(near[:, :k], size - 1))
         wanted = min(_TURNS[points.shape[1] - d], max(1, len(self._graph.rotations.values) - 1))
         turns, apart = self._graph.nearest_rotations(points[:, d:], wanted + 1)
         # the root of 1 − cos grows with the angle

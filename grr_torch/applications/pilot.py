@@ -145,7 +145,8 @@ class Pilot:
             self._set_goals(arms, chosen, goals[routed], goals_q[routed])
             steps.q[routed], left[routed] = self._route(arms, chosen, looked=True)
             arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[routed]
-            self._find_ended(arms, chosen, steps.q[routed], targets[routed])
+            found = ~left[routed]
+            self._find_ended(arms, chosen[found], steps.q[routed[found]], targets[routed[found]])
         for row in left.nonzero()[0].tolist():
             step = self._back(arms, int(which[row]), goals_q[row])
             if step is None:
@@ -178,6 +179,8 @@ class Pilot:
         longer = np.minimum(np.where(again, 2 * arms.doubt[which], arms.doubt[which]), _MOST_DOUBT)
         arms.doubt[which] = np.where(moved, 1, longer)
         if moved.any():
+            for arm in which[moved].tolist():
+                arms.avoided[arm] = frozenset()
             arms.last_goal[which[moved]] = goals[moved]
             arms.last_vertex[which[moved]] = self._last_vertices(goals[moved], goals_q[moved])
 

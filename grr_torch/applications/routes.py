@@ -15,8 +15,8 @@ from grr_torch.spaces.configuration import distance
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
-# goals whose shortest paths are remembered
-_GOALS = 64
+# goals, with the edges that are avoided on the way, whose shortest paths are remembered
+_GOALS = 256
 
 
 class Routes:

@@ -125,7 +125,11 @@ class Teleoperator:
     @property
     def configuration(self) -> Tensor | None:
         """(*batch, n) where the arms are, as last commanded or reset; None before the first target where none is."""
-        return None if self._arms is None else torch.from_numpy(self._arms.q.reshape(*self._batch, -1).copy())
+        return (
+            None
+            if self._arms is None
+            else torch.from_numpy(self._arms.q.reshape(*self._batch, self.roadmap.robot.n).copy())
+        )
 
     def reset(self, configuration: Tensor | None = None) -> None:
         """Starts anew: the next target is taken wherever it is, and no input is too old.
@@ -138,7 +142,7 @@ class Teleoperator:
         """
         robot = self.roadmap.robot
         if configuration is not None:
-            q = robot.columns(configuration).T
+            q = robot.columns(configuration).detach().T
             if not bool(q.isfinite().all()):
                 raise ParameterError("configuration", "NaN or infinite values", "finite values")
             self._batch, self._arms = configuration.shape[:-1], Arms.at(self._follower, q.numpy().copy())
@@ -198,7 +202,9 @@ class Teleoperator:
         unknown = (~(norms(points) < np.inf)).nonzero()[0]
         if len(unknown):
             arms.look(self._follower, unknown)
-        return Command(torch.from_numpy(q.reshape(*self._batch, -1).copy()), STATUSES[codes].reshape(self._batch))
+        return Command(
+            torch.from_numpy(q.reshape(*self._batch, self.roadmap.robot.n).copy()), STATUSES[codes].reshape(self._batch)
+        )
 
     def _start(self, batch: torch.Size, targets: Array) -> None:
         """Arms at their first targets."""

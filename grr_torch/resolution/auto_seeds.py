@@ -4,8 +4,8 @@ A candidate starts from one configuration, a medoid of the self-motion manifold 
 the axis of the first joint. Turned rigidly with that joint and projected, a posture that the task allows all round
 closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph and the best
 of them relaxed there: so few vertices soon come to rest, and many candidates come to nearly the same. The best of these
-maps are expanded and relaxed on the task graph itself; the one with the smallest slopes, where what is missing counts
-as steep, seeds the roadmap with all its coarse vertices.
+maps are expanded and relaxed on the task graph itself, unless it is large; the one with the smallest slopes, where what
+is missing counts as steep, seeds the roadmap with all its coarse vertices.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ _STATIONS = 12
 _COARSE = {2: 120, 3: 300}
 # so many times as many, and so many rotations at least, where rotation varies
 _TURNED, _FEWEST = 4, 8
+# of a task graph with more vertices, on which a trial would take long, the best coarse map is taken as it is
+_MOST_TRIED = 10_000
 # vertices averaged over on it
 _NEIGHBOURS = 24
 # share of the candidates that are relaxed on it, and of those that are tried on the task graph itself
@@ -96,10 +98,15 @@ def find_seeds(
     order = _costs(robot, task, coarse, relaxed).argsort(stable=True)[: math.ceil(_FINALISTS * len(paths))].tolist()
     finalists = [relaxed[rank][~relaxed[rank].isnan().any(1)] for rank in order]
     progress("choosing seeds", 2, 3)
-    maps = _expansions(robot, task, graph, finalists, default_neighbours(task), tolerances)
-    costs = _costs(robot, task, graph, _relaxed(robot, task, graph, maps, tolerances, _FINAL_ROUNDS))
+    if len(graph.points) > _MOST_TRIED:
+        return finalists[0]
+    tried: list[Tensor] = []
+    for seeds in finalists:
+        # one after the other: a map and its relaxation are all that is held besides
+        expanded = _expansions(robot, task, graph, [seeds], default_neighbours(task), tolerances)
+        tried.append(_relaxed(robot, task, graph, expanded, tolerances, _FINAL_ROUNDS))
     progress("choosing seeds", 3, 3)
-    return finalists[int(costs.argmin())]
+    return finalists[int(_costs(robot, task, graph, torch.cat(tried)).argmin())]
 
 
 def _coarse(task: TaskSpace, graph: TaskGraph, points: int) -> TaskGraph:

@@ -1,7 +1,7 @@
 """`SphereKernel` for a few configurations on the CPU, in numpy.
 
 All spheres are placed at once, whether they are near or not: up to some dozens of configurations the cost is that of
-calls. Formulas are those of `SphereKernel`.
+calls. Distances are those of `SphereKernel`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ class FewSpheres:
         pairs, columns = near.nonzero()
         hit = np.zeros(width, dtype=bool)
         if len(pairs):
-            a, b = (placed[side[pairs], 1:, :, columns] for side in (self._first, self._second))
+            # relative to the first link, so that little is lost in the difference of squares
+            near_to = placed[self._first[pairs], 0, :, columns][:, None]
+            a, b = (placed[side[pairs], 1:, :, columns] - near_to for side in (self._first, self._second))
             squared = (a * a).sum(2)[:, :, None] + (b * b).sum(2)[:, None] - 2.0 * np.matmul(a, b.transpose(0, 2, 1))
             touching = ~(squared >= np.square(self._reach + margin)[pairs]).reshape(len(pairs), -1).all(1)
             hit[columns[touching]] = True

@@ -17,6 +17,8 @@ from grr_torch.robots.spheres import Sphere, SphereModel
 
 # sphere-pair distances held at once: they should stay in the cache
 _PAIRS_AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 26}
+# and those of a few configurations, all of which are held
+_PAIRS_OF_FEW = 1 << 20
 
 
 class _Pair(NamedTuple):
@@ -118,7 +120,7 @@ class SphereKernel:
 
     def collides(self, frames: Tensor, margin: float) -> Tensor:
         """Whether any checked pair of links is nearer than `margin` [m]: (N,) bool; true where a frame is NaN."""
-        if are_few(frames):
+        if are_few(frames) and self._padded * frames.shape[3] <= _PAIRS_OF_FEW:
             return torch.from_numpy(self._few.collides(frames.detach().numpy(), margin))
         near = ~(self._squared(frames, self.bounds) >= (self.bound_reach + margin).square())
         hit = torch.zeros(frames.shape[3], dtype=torch.bool, device=frames.device)
@@ -129,6 +131,11 @@ class SphereKernel:
             for part, squared in pair.squared_distances(relative):
                 hit[chosen[part]] |= ~(squared >= limit).flatten(0, 1).all(0)
         return hit
+
+    @cached_property
+    def _padded(self) -> int:
+        """Pairs of spheres of a configuration, if all links had as many as the largest."""
+        return len(self.spheres) * max(max(pair.reach.shape[:2]) for pair in self.spheres) ** 2
 
     @cached_property
     def _few(self) -> FewSpheres:
