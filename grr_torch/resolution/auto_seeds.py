@@ -4,8 +4,9 @@ A candidate starts from one configuration, a medoid of the self-motion manifold 
 the axis of the first joint. Turned rigidly with that joint and projected, a posture that the task allows all round
 closes on itself, as repeatable inverse kinematics asks. All candidates are expanded over a coarse graph and the best
 of them relaxed there: so few vertices soon come to rest, and many candidates come to nearly the same. The best of these
-maps are expanded and relaxed on the task graph itself, unless it is large; the one with the smallest slopes, where what
-is missing counts as steep, seeds the roadmap with all its coarse vertices.
+maps, as seeds, are expanded and relaxed on the task graph itself; the one with the smallest slopes, where what is
+missing or broken counts as steep, seeds the roadmap with all its vertices. Of a large task graph, the best coarse map
+does.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError, SeedError, check_seed
 from grr_torch.progress import Progress, silent
+from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project_columns, tool_points
 from grr_torch.resolution.expand import default_neighbours, grow
 from grr_torch.resolution.reachability import from_random_starts, within_reach
@@ -46,15 +48,17 @@ _MOST_TRIED = 10_000
 # vertices averaged over on it
 _NEIGHBOURS = 24
 # share of the candidates that are relaxed on it, and of those that are tried on the task graph itself
-_RELAXED = 0.08
+_RELAXED = 0.16
 _FINALISTS = 0.03
 # in so many rounds each
-_ROUNDS = 16
-_FINAL_ROUNDS = 8
+_ROUNDS = 8
+_FINAL_ROUNDS = 5
 # edges steeper than this many times the median are not relaxed
 _STEEP = 6.0
-# an edge that is missing, or steeper, counts as this many times the smallest median of slopes
+# an edge that is missing, broken, or steeper, counts as this many times the smallest median of slopes
 _MISSING = 40.0
+# edges less steep than this many times the median are hardly ever broken
+_SUSPECT = 2.0
 
 
 def find_seeds(
@@ -106,7 +110,9 @@ def find_seeds(
         expanded = _expansions(robot, task, graph, [seeds], default_neighbours(task), tolerances)
         tried.append(_relaxed(robot, task, graph, expanded, tolerances, _FINAL_ROUNDS))
     progress("choosing seeds", 3, 3)
-    return finalists[int(_costs(robot, task, graph, torch.cat(tried)).argmin())]
+    maps = torch.cat(tried)
+    chosen = maps[int(_costs(robot, task, graph, maps, _broken(robot, task, graph, maps, tolerances)).argmin())]
+    return chosen[~chosen.isnan().any(1)]
 
 
 def _coarse(task: TaskSpace, graph: TaskGraph, points: int) -> TaskGraph:
@@ -240,13 +246,31 @@ def _turned(task: TaskSpace, points: Tensor, axis: Tensor, origin: Tensor, angle
     return torch.cat([moved, task.rotations.turned(points[:, d:], axis, angle)], dim=1)
 
 
-def _costs(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Tensor:
-    """(C,) sums of slopes over all edges of a graph, of maps (C, V, n); what is missing counts as steep."""
+def _costs(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, broken: Tensor | None = None) -> Tensor:
+    """(C,) sums of slopes over all edges of a graph, of maps (C, V, n); what is missing or broken counts as steep."""
+    slopes = _slopes(robot, task, graph, maps)
+    limit = _MISSING * slopes.nanmedian(dim=1).values.nan_to_num(torch.inf).amin()
+    worst = slopes.isnan() if broken is None else slopes.isnan() | broken
+    return torch.where(worst, limit, slopes.clamp(max=limit)).sum(1)
+
+
+def _slopes(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Tensor:
+    """(C, E) D_q / D_p of all edges, of maps (C, V, n); NaN where an end is unresolved."""
     first, second = graph.edges.to(maps.device).unbind(1)
     points = graph.points.to(maps)
-    slopes = distance(maps[:, first], maps[:, second], robot.continuous) / task.distance(points[first], points[second])
-    limit = _MISSING * slopes.nanmedian(dim=1).values.nan_to_num(torch.inf).amin()
-    return torch.where(slopes.isnan(), limit, slopes.clamp(max=limit)).sum(1)
+    return distance(maps[:, first], maps[:, second], robot.continuous) / task.distance(points[first], points[second])
+
+
+def _broken(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tolerances: Tolerances) -> Tensor:
+    """(C, E) edges of maps (C, V, n) that are steep and not continuous."""
+    slopes = _slopes(robot, task, graph, maps)
+    broken = slopes > _SUSPECT * slopes.nanmedian(dim=1, keepdim=True).values
+    which, edges = broken.nonzero().T
+    first, second = graph.edges.to(maps.device)[edges].unbind(1)
+    points = graph.points.to(maps)
+    ends = points[first], points[second], maps[which, first], maps[which, second]
+    broken[which, edges] = ~is_continuous(robot, task, *ends, tolerances=tolerances)
+    return broken
 
 
 def _relaxed(
@@ -258,7 +282,7 @@ def _relaxed(
     first, second = copies.edges.to(q.device).unbind(1)
     points = copies.points.to(q)
     lengths = task.distance(points[first], points[second])
-    slopes = distance(q[first], q[second], robot.continuous) / lengths
+    slopes = _slopes(robot, task, graph, maps).flatten()
     if not bool(slopes.isfinite().any()):
         return maps
     kept = slopes <= _STEEP * float(slopes[slopes.isfinite()].median())

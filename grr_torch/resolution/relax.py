@@ -3,7 +3,7 @@
 The sum of D_q / D_p over the edges is minimised under the constraint that every tool stays where it is. Each round
 is one Gauss–Newton step: around the present configurations, the sum of the edges' weighted squares over all motions
 that the null spaces of the Jacobians allow is minimised by conjugate gradients. The weights 1 / (D_p · D_q) make
-its squares stand for the norms themselves (iteratively reweighted least squares).
+its squares stand for the norms themselves (iteratively reweighted least squares). The first rounds begin with hops.
 """
 
 from __future__ import annotations
@@ -21,12 +21,15 @@ from grr_torch.progress import Progress
 from grr_torch.projection.columns import null_space_projector, transposed_product
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
+from grr_torch.resolution.hops import hop
 from grr_torch.resolution.objectives import Objective
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import difference, normalise
 from grr_torch.spaces.task import TaskSpace
 
 _ROUNDS = 40
+# rounds that begin with hops; where objectives count there are none, for such a map has been relaxed without them
+_HOPS = 8
 # rounds end when one lowers the cost by less than this share
 _LEAST_GAIN = 2e-5
 _GRADIENT_STEPS = 60
@@ -44,12 +47,14 @@ class _Incidence(NamedTuple):
         edges: (2E,) index of an edge.
         ends: (2E,) its other vertex.
         signs: (2E,) 1 at its first vertex, −1 at its second.
+        counts: (V,) how many edges a vertex has.
     """
 
     starts: Tensor
     edges: Tensor
     ends: Tensor
     signs: Tensor
+    counts: Tensor
 
     @staticmethod
     def of(edges: Tensor, like: Tensor) -> _Incidence:
@@ -58,7 +63,7 @@ class _Incidence(NamedTuple):
         order = vertices.argsort(stable=True)
         counts = vertices.bincount(minlength=like.shape[1])
         signs = torch.where(order < count, like.new_tensor(1.0), -1.0)
-        return _Incidence(counts.cumsum(0) - counts, order % count, edges.flip(0).flatten()[order], signs)
+        return _Incidence(counts.cumsum(0) - counts, order % count, edges.flip(0).flatten()[order], signs, counts)
 
     def gather(self, forces: Tensor) -> Tensor:
         """(n, V) sums of what edges (n, E) do to their first vertex, and the opposite to their second."""
@@ -67,6 +72,17 @@ class _Incidence(NamedTuple):
     def neighbours(self, x: Tensor, weights: Tensor) -> Tensor:
         """(n, V) sums of x (n, V) over the edges' other ends, weighted (E,)."""
         return _sum_bags(self.ends, x, self.starts, weights[self.edges])
+
+    def sums(self, values: Tensor) -> Tensor:
+        """(V,) sums of values of edges (E,)."""
+        return embedding_bag(self.edges, values[:, None], self.starts, mode="sum")[:, 0]
+
+    def around(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """For all edges of vertices (K,): which of those it belongs to, and its place in `edges` and `ends`."""
+        counts = self.counts[vertices]
+        rank = torch.arange(len(vertices), device=vertices.device).repeat_interleave(counts)
+        first = self.starts[vertices] - (counts.cumsum(0) - counts)
+        return rank, first[rank] + torch.arange(len(rank), device=vertices.device)
 
 
 def _sum_bags(indices: Tensor, columns: Tensor, starts: Tensor, weights: Tensor) -> Tensor:
@@ -108,11 +124,31 @@ class Network:
 
     def costs(self, q: Tensor) -> Tensor:
         """(P,) sums of D_q / D_p, rounded off at zero, by part, and of the objectives' costs, for (n, V)."""
-        (moved,) = in_pieces(lambda ends: (self._between(q, ends).square().sum(0),), self.edges)
-        slopes = moved.add_(_SHORTEST**2).sqrt_() / self.lengths
-        if self.parts is not None:
-            return self.parts[self.edges[0]].bincount(slopes, minlength=int(self.parts.max()) + 1)
-        return slopes.sum()[None] + sum(objective.cost(q) for objective in self.objectives)
+        return self.by_part(self.slopes(q)) + sum(objective.cost(q) for objective in self.objectives)
+
+    def slopes(self, q: Tensor) -> Tensor:
+        """(E,) D_q / D_p, rounded off at zero."""
+
+        def measure(ends: Tensor, lengths: Tensor) -> tuple[Tensor]:
+            return (self.slopes_between(q[:, ends[0]], q[:, ends[1]], lengths),)
+
+        return in_pieces(measure, self.edges, self.lengths)[0]
+
+    def slopes_between(self, first: Tensor, second: Tensor, lengths: Tensor) -> Tensor:
+        """(M,) D_q / D_p, rounded off at zero, between configurations (n, M) at points so far apart."""
+        moved = difference(first, second, self.robot.continuous[:, None])
+        return moved.square().sum(0).add_(_SHORTEST**2).sqrt_() / lengths
+
+    def by_part(self, values: Tensor) -> Tensor:
+        """(P,) sums of values of edges (E,), by part."""
+        if self.parts is None:
+            return values.sum()[None]
+        return self.parts[self.edges[0]].bincount(values, minlength=int(self.parts.max()) + 1)
+
+    @cached_property
+    def part_of_vertex(self) -> Tensor:
+        """(V,) number of the part that a vertex belongs to."""
+        return torch.zeros_like(self.targets[0], dtype=torch.long) if self.parts is None else self.parts
 
     def _between(self, q: Tensor, ends: Tensor) -> Tensor:
         """(n, M) wrapped differences between the columns that `ends` (2, M) are."""
@@ -143,7 +179,7 @@ def relax(
     kept: Stage = UNKEPT,
 ) -> Tensor:
     """Configurations (n, V) of lower cost: converged, within limits and free of self-collision like those given."""
-    parts = network.parts if network.parts is not None else torch.zeros_like(network.targets[0], dtype=torch.long)
+    parts = network.part_of_vertex
     costs = network.costs(q)
     damping = torch.full_like(costs, 1e-2)
     going_on = torch.ones_like(costs, dtype=torch.bool)
@@ -154,10 +190,14 @@ def relax(
     with one_thread(), torch.no_grad():
         for done in range(begin, rounds):
             progress("refining", done, rounds)
+            costs_before = costs
+            if done < _HOPS and not network.objectives:
+                q = hop(network, q, going_on[parts], tolerances)
+                costs = network.costs(q)
             moved = move(network, q, gauss_newton_step(network, q, damping[parts]), tolerances)
             new_costs = network.costs(moved)
             better = going_on & (new_costs < costs)
-            going_on = torch.where(better, new_costs < (1.0 - _LEAST_GAIN) * costs, going_on & (damping <= 1e2))
+            going_on = torch.where(better, new_costs < (1.0 - _LEAST_GAIN) * costs_before, going_on & (damping <= 1e2))
             q, costs = torch.where(better[parts], moved, q), torch.where(better, new_costs, costs)
             damping = torch.where(better, (0.3 * damping).clamp_min(1e-4), 10.0 * damping)
             last = done + 1 == rounds or not bool(going_on.any())
