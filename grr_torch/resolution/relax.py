@@ -29,7 +29,7 @@ from grr_torch.spaces.task import TaskSpace
 
 _ROUNDS = 40
 # rounds that begin with hops; where objectives count there are none, for such a map has been relaxed without them
-_HOPS = 8
+_HOPS = 5
 # rounds end when one lowers the cost by less than this share
 _LEAST_GAIN = 2e-5
 _GRADIENT_STEPS = 60
