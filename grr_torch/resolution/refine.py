@@ -11,9 +11,10 @@ from torch import Tensor
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances
+from grr_torch.resolution.blend import without_losses
 from grr_torch.resolution.certify import certify
-from grr_torch.resolution.checkpoint import UNKEPT, Checkpoint, Stage
-from grr_torch.resolution.edges import EdgeCheck, continuous_edges
+from grr_torch.resolution.checkpoint import Checkpoint
+from grr_torch.resolution.edges import EdgeCheck
 from grr_torch.resolution.objectives import Objective, check_objectives, measure_objective
 from grr_torch.resolution.quality import edge_slopes
 from grr_torch.resolution.relax import Network, relax
@@ -38,8 +39,8 @@ def refine(
 
     Unresolved vertices and the ends of broken edges are tried again from all their neighbours and from random starts;
     then all configurations move along their self-motion manifolds at once. No vertex and no connected edge is lost:
-    where the relaxed map breaks an edge, its ends go back to where they were. With objectives, the smoothest map is
-    then relaxed once more, for the sum that `grr_torch.resolution.objectives` gives.
+    where the relaxed map breaks an edge, its ends go back part of the way, or to where they were. With objectives, the
+    smoothest map is then relaxed once more, for the sum that `grr_torch.resolution.objectives` gives.
 
     Args:
         roadmap: The roadmap.
@@ -111,7 +112,7 @@ def _relaxed(
     new = certify(network, cells, new, tolerances, progress, checkpoint).T
     configurations = roadmap.configurations.clone()
     configurations[vertices] = new.cpu()
-    return _without_losses(roadmap, configurations, tolerances, check, progress, checkpoint.stage("edges-again"))
+    return without_losses(roadmap, configurations, tolerances, check, progress, checkpoint.stage("edges-again"))
 
 
 def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping[str, float]) -> Network:
@@ -126,34 +127,3 @@ def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping
         if (mean := _figures(roadmap, name)["mean"]) is not None
     )
     return Network(robot, task, points.T.contiguous(), edges.T.contiguous().to(robot.device), lengths, objectives)
-
-
-def _without_losses(
-    roadmap: Roadmap,
-    configurations: Tensor,
-    tolerances: Tolerances,
-    check: EdgeCheck,
-    progress: Progress,
-    kept: Stage,
-) -> Roadmap:
-    """The roadmap with new configurations, but with its own round edges that would be lost."""
-    connected = torch.zeros_like(roadmap.connected)
-    stale = torch.ones_like(roadmap.connected)
-    configurations = configurations.clone()
-    robot, task, points, resolved = roadmap.robot, roadmap.task, roadmap.points, roadmap.resolved
-    while True:
-        edges = roadmap.edges[stale]
-        connected[stale] = continuous_edges(
-            robot, task, points, configurations, resolved, edges, tolerances, progress, kept, check
-        ).cpu()
-        kept = UNKEPT  # the first time takes nearly all of it
-        lost = roadmap.edges[roadmap.connected & ~connected].unique()
-        if len(lost) == 0:
-            return replace(roadmap, configurations=configurations, connected=connected)
-        moved = (configurations != roadmap.configurations).any(1) & resolved
-        if not bool(moved.any()):
-            # an edge was called connected that is not
-            return replace(roadmap, connected=connected)
-        back = lost[moved[lost]] if bool(moved[lost].any()) else moved.nonzero()[:, 0]
-        configurations[back] = roadmap.configurations[back]
-        stale = torch.isin(roadmap.edges, back).any(1)

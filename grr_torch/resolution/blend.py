@@ -1,0 +1,80 @@
+"""Blending a relaxed roadmap with what it was, so that no connected edge is lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from grr_torch.progress import Progress
+from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.resolution.checkpoint import UNKEPT, Stage
+from grr_torch.resolution.edges import EdgeCheck, continuous_edges
+from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.spaces.configuration import difference, normalise
+
+# a configuration that would move by less than this share of its way stays where it was
+_LEAST_SHARE = 0.1
+# a blended configuration is projected no farther than this [rad]
+_NEAR = 0.1
+
+
+def without_losses(
+    roadmap: Roadmap,
+    configurations: Tensor,
+    tolerances: Tolerances,
+    check: EdgeCheck,
+    progress: Progress,
+    kept: Stage,
+) -> Roadmap:
+    """The roadmap with new configurations, but for the surroundings of edges that would be lost.
+
+    The ends of such edges go half of the way only, then a quarter of it, and in the end none. Sent back at once, they
+    would break the edges to those of their neighbours that have gone all the way, and the whole map might follow.
+
+    Args:
+        roadmap: The roadmap as it was.
+        configurations: (V, n) new ones of its resolved vertices.
+        tolerances: Of the projections.
+        check: What checks batches of edges.
+        progress: Told how many edges are checked.
+        kept: Where it is kept which edges are connected at first, which takes nearly all of the time.
+    """
+    robot, task, points, resolved = roadmap.robot, roadmap.task, roadmap.points, roadmap.resolved
+    connected, stale = torch.zeros_like(roadmap.connected), torch.ones_like(roadmap.connected)
+    blended, share = configurations.clone(), resolved.to(configurations.dtype)
+    while True:
+        edges = roadmap.edges[stale]
+        connected[stale] = continuous_edges(
+            robot, task, points, blended, resolved, edges, tolerances, progress, kept, check
+        ).cpu()
+        kept = UNKEPT
+        lost = roadmap.edges[roadmap.connected & ~connected].unique()
+        if len(lost) == 0:
+            return replace(roadmap, configurations=blended, connected=connected)
+        moved = share > 0.0
+        if not bool(moved.any()):
+            # an edge was called connected that is not
+            return replace(roadmap, connected=connected)
+        back = lost[moved[lost]] if bool(moved[lost].any()) else moved.nonzero()[:, 0]
+        share[back] *= 0.5
+        share[share < _LEAST_SHARE] = 0.0
+        blended[back], there = _part_way(roadmap, configurations, back, share[back], tolerances)
+        share[back[~there]] = 0.0
+        stale = torch.isin(roadmap.edges, back).any(1)
+
+
+def _part_way(
+    roadmap: Roadmap, configurations: Tensor, vertices: Tensor, share: Tensor, tolerances: Tolerances
+) -> tuple[Tensor, Tensor]:
+    """Configurations (K, n) of vertices after a share (K,) of their way, and which are there; others are as before."""
+    robot = roadmap.robot
+    wraps = robot.continuous.cpu()
+    before = roadmap.configurations[vertices]
+    guesses = normalise(before + share[:, None] * difference(before, configurations[vertices], wraps), wraps)
+    targets = roadmap.points[vertices].to(robot.lower).T.contiguous()
+    solved, valid = project_columns(robot, roadmap.task, targets, guesses.to(robot.lower).T.contiguous(), tolerances)
+    found = solved.T.to(before)
+    there = valid.cpu() & (share > 0.0) & ((found - guesses).square().sum(1) <= _NEAR**2)
+    return torch.where(there[:, None], found, before), there
