@@ -111,7 +111,9 @@ def build(
     from grr_torch.output import atomic_write, check_writable
     from grr_torch.resolution.auto_seeds import CANDIDATES
     from grr_torch.resolution.build import build as build_roadmap
+    from grr_torch.resolution.problem import pose_problem
     from grr_torch.resolution.report import summary, traded
+    from grr_torch.resolution.stages import build_stages
     from grr_torch.robots.load import load_robot
 
     with progress_bar() as progress, _edge_check(engine, address, device) as check:
@@ -136,20 +138,30 @@ def build(
             if recording.resolve() == out.resolve():
                 raise ParameterError("--record", recording, f"another file than the roadmap's, {out}")
         box = None if bounds is None else _bounds(bounds)
+        problem = pose_problem(arm, _task(arm, task, box, rotation, axis), points, box, _seeds(arm, seeds), rotations)
+        weights = _weights(objective or [])
+        progress.foretell(
+            build_stages(
+                problem.task,
+                method=method,
+                found_seeds=isinstance(problem.seeds, str),
+                refine=refine,
+                objectives=any(weights.values()),
+                reachability=reachability > 0,
+            )
+        )
         try:
             roadmap = build_roadmap(
                 arm,
-                _task(arm, task, box, rotation, axis),
-                points=points,
-                bounds=box,
-                seeds=_seeds(arm, seeds),
-                rotations=rotations,
+                problem.task,
+                points=problem.graph,
+                seeds=problem.seeds,
                 candidates=CANDIDATES if candidates is None else candidates,
                 method=method,
                 samples=samples,
                 neighbours=neighbours,
                 refine=refine,
-                objectives=_weights(objective or []),
+                objectives=weights,
                 reachability=reachability,
                 seed=seed,
                 checkpoint=checkpoint,

@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TextIO, TypeVar
 import typer
 
 from grr_torch.errors import GrrError, GrrWarning, ParameterError
-from grr_torch.progress import Progress
+from grr_torch.progress import Outlook, Plan
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -55,31 +55,59 @@ def _show_warning(
 
 
 @contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """A bar for each stage on standard error, gone when the work is done; silent where there is no terminal.
-
-    What is left is extrapolated for the stage alone, from how fast it has been; stages may end early.
-    """
+def progress_bar() -> Iterator[ProgressBar]:
+    """A bar for each stage on standard error, gone when the work is done; silent where there is no terminal."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
     console = Console(stderr=True)
-    times = (TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn())
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times)
-    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        tasks: dict[str, Any] = {}
-        reported: dict[str, int] = {}
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    left = TextColumn("{task.fields[left]}")
+    with Bar(*columns, left, console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield ProgressBar(bar)
 
-        def report(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            elif done < reported[stage]:
-                bar.reset(tasks[stage])  # it is done once more, or goes on from a checkpoint: its speed is another
-            reported[stage] = done
-            bar.update(tasks[stage], completed=done, total=total)
 
-        yield report
+class ProgressBar:
+    """What work reports to.
+
+    Where there is a plan of its stages, what is left of all of it is told; else, of the present stage alone, from how
+    fast that has been. Stages may end early.
+    """
+
+    def __init__(self, bar: Any) -> None:
+        self._bar = bar
+        self._tasks: dict[str, Any] = {}
+        self._reported: dict[str, int] = {}
+        self._outlook: Outlook | None = None
+
+    def foretell(self, plan: Plan) -> None:
+        """Tells from here on what is left of a plan."""
+        self._outlook = Outlook(plan)
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Takes a report, as of `Progress`."""
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bar.add_task(stage, total=total, left="")
+        elif done < self._reported[stage]:
+            self._bar.reset(self._tasks[stage])  # it is done once more, or goes on from a checkpoint, at another speed
+        self._reported[stage] = done
+        for task in self._tasks.values():
+            self._bar.update(task, left="")
+        self._bar.update(self._tasks[stage], completed=done, total=total, left=self._left(stage, done, total))
+
+    def _left(self, stage: str, done: int, total: int) -> str:
+        if self._outlook is not None:
+            self._outlook(stage, done, total)
+            seconds = self._outlook.left()
+            return "" if seconds is None else f"about {_duration(seconds)} left of all"
+        seconds = self._bar.tasks[self._tasks[stage]].time_remaining
+        return "" if seconds is None or done == total else f"about {_duration(seconds)} left"
+
+
+def _duration(seconds: float) -> str:
+    hours, minutes = divmod(round(seconds) // 60, 60)
+    return f"{hours}:{minutes:02}:{round(seconds) % 60:02}"
 
 
 def print_json(data: dict[str, Any]) -> None:
