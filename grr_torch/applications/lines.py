@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import Array, Mask
+from grr_torch.pieces import FEW, Array, Mask
 from grr_torch.projection.continuity import continuous_columns
+from grr_torch.projection.few import project_few
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace
@@ -117,22 +118,23 @@ class Follower:
         starts = q[rows] + fraction * motion[rows]
         if offsets is not None:
             starts[np.cumsum(aim.looked.sum(1)) - 1] = guesses
-        solved, valid = project_columns(
-            self.robot,
-            self.task,
-            torch.from_numpy(on_way.T),
-            torch.from_numpy(starts.T),
-            self.tolerances,
-            check_collision=False,
-        )
+        solved, valid = self._projected(on_way.T, starts.T)
         # what is not looked at on the way does no harm: it stands where the line ends
         found = np.empty((*aim.looked.shape, self.robot.n), q.dtype)
         reached = np.empty(aim.looked.shape, dtype=bool)
-        found[aim.looked], reached[aim.looked] = solved.T.numpy(), valid.numpy()
+        found[aim.looked], reached[aim.looked] = solved.T, valid
         found = np.where(aim.looked[..., None], found, found[:, -1:])
         reached = np.where(aim.looked, reached, reached[:, -1:])
         after = np.where(aim.near[:, None], targets, p + aim.fractions[:, -2, None] * (targets - p))
         return self._judge(aim, found, reached, after, p, targets)
+
+    def _projected(self, points: Array, guesses: Array) -> tuple[Array, Mask]:
+        """`project_columns` for arrays, self-collision left open."""
+        if guesses.shape[1] <= FEW:
+            return project_few(self.robot, self.task, self.tolerances, points, guesses)
+        columns = torch.from_numpy(points), torch.from_numpy(guesses)
+        solved, valid = project_columns(self.robot, self.task, *columns, self.tolerances, check_collision=False)
+        return solved.numpy(), valid.numpy()
 
     def _aim(self, q: Array, motion: Array) -> _Aim:
         """Which points on lines with motions (B, n) are looked at: no farther than half of ε apart."""

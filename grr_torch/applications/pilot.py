@@ -101,7 +101,12 @@ class Pilot:
             fits = lines.converged & (norms(offsets) <= _OFFSET)
             arms.offsets[chosen] = np.where(fits[:, None], offsets, 0.0)
             found = lines.converged & ~lines.collides
-            found &= self.solver.on_map(torch.from_numpy(lines.ends), torch.from_numpy(guesses)).numpy()
+            # what is near its guess is on the map
+            far = (found & ~fits).nonzero()[0]
+            if len(far):
+                found[far] = self.solver.on_map(
+                    *(torch.from_numpy(part[far]) for part in (lines.ends, guesses))
+                ).numpy()
             free = found & lines.direct & arms.on_task[chosen]
             direct[rows], valid[rows] = free, free | (found & ~arms.barred_from(chosen, targets[rows], _SAME_GOAL))
             ends[rows] = lines.ends

@@ -14,11 +14,11 @@ from torch.nn.functional import embedding_bag
 
 from grr_torch.applications.around import Around, AroundProduct
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import one_thread
+from grr_torch.pieces import FEW, Array, one_thread
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
-from grr_torch.spaces.configuration import average, difference, embed
+from grr_torch.spaces.configuration import average, average_of_few, difference, embed
 from grr_torch.spaces.graph import find_lattice
 
 if TYPE_CHECKING:
@@ -87,6 +87,7 @@ class Solver:
         self._around = (AroundProduct if turning else Around)(roadmap, vertices, self.radius)
         self._continuous = self.robot.continuous.cpu()
         self._embedded = embed(roadmap.configurations[vertices].to(torch.float64), self._continuous)
+        self._embedded_array, self._continuous_array = self._embedded.numpy(), self._continuous.numpy()
         self._neighbours = tuple(part.numpy() for part in roadmap.neighbours)
         self._joined = _neighbour_matrix(roadmap, vertices).numpy() if len(vertices) <= _MATRIX else None
         # where rotation varies, suspects are looked up by their nearest vertices
@@ -152,15 +153,22 @@ class Solver:
         positions = points[:, : self.task.dimension].numpy()
         nearest, weights, near = self._around.weigh(points)
         weights = weights * self._largest_part(nearest, weights > 0.0)
-        sums = embedding_bag(
-            torch.from_numpy(nearest), self._embedded, per_sample_weights=torch.from_numpy(weights), mode="sum"
-        )
+        averages = self._averages(nearest, weights)
         codes = np.full(len(points), _SOLVED, dtype=np.uint8)
         if certified:
             self._mark_uncertified(codes, positions, nearest[:, 0])
         codes[~near | ~(weights.sum(1) > 0.0)] = _TOO_FAR
         codes[((positions < self._low) | (positions > self._high)).any(1)] = _OUTSIDE
-        return average(sums, self._continuous), torch.from_numpy(codes)
+        return averages, torch.from_numpy(codes)
+
+    def _averages(self, nearest: Array, weights: Array) -> Tensor:
+        """(N, n) circular averages over vertices (N, k), weighted (N, k)."""
+        if len(nearest) <= FEW:
+            sums = np.matmul(weights[:, None], self._embedded_array[nearest])[:, 0]
+            return torch.from_numpy(average_of_few(sums, self._continuous_array))
+        indices, counts = torch.from_numpy(nearest), torch.from_numpy(weights)
+        sums = embedding_bag(indices, self._embedded, per_sample_weights=counts, mode="sum")
+        return average(sums, self._continuous)
 
     def on_map(self, q: Tensor, guesses: Tensor) -> Tensor:
         """Whether configurations (N, n) are the map's, (N,), as far as the averages (N, n) that led to them tell.

@@ -5,13 +5,13 @@ There is nothing to gain from pieces that stay in the cache here, and no need to
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from grr_torch.pieces import Array
+from grr_torch.pieces import Array, Mask
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.step import (
     DAMPING,
@@ -21,10 +21,6 @@ from grr_torch.projection.step import (
     PATIENCE,
     ROTATION_LENGTH,
     SHORTEST_STEP,
-    Equations,
-    Limits,
-    nudge,
-    stop_at_limits,
 )
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace
@@ -38,20 +34,19 @@ if TYPE_CHECKING:
 
 # errors of a hostile guess may be beyond all numbers: they do not converge
 @np.errstate(over="ignore", invalid="ignore")
-def converge_few(
-    robot: Robot, task: TaskSpace, tolerances: Tolerances, limits: Limits | None, targets: Tensor, q: Tensor
-) -> tuple[Tensor, Tensor]:
+def project_few(robot: Robot, task: TaskSpace, tolerances: Tolerances, targets: Array, q: Array) -> tuple[Array, Mask]:
     """Configurations (n, N), NaN where not converged, and converged (N,), for points (width, N) and guesses (n, N)."""
-    few, wanted = robot.tree.few, targets.numpy()
-    solved, valid = np.full(q.shape, np.nan, q.numpy().dtype), np.zeros(q.shape[1], dtype=bool)
-    now = (q if limits is None else q.clamp(*limits)).numpy()
+    few, rows = robot.tree.few, task.dimension
+    limits = (robot.lower.numpy()[:, None], robot.upper.numpy()[:, None]) if robot.has_limits else None
+    solved, valid = np.full(q.shape, np.nan, q.dtype), np.zeros(q.shape[1], dtype=bool)
+    now = q if limits is None else np.clip(q, *limits)
     rank = np.arange(q.shape[1])
     best = before = np.full(q.shape[1], np.inf)
     for iteration in range(tolerances.iterations + 1):
         frames = few.frames(now)
-        error = task.error_of_few(wanted, frames[-2, 3], frames[-2, :3].transpose(1, 0, 2))
+        error = task.error_of_few(targets, frames[-2, 3], frames[-2, :3].transpose(1, 0, 2))
         squared = error * error
-        translation, rotation = squared[: task.dimension].sum(0), squared[task.dimension :].sum(0)
+        translation, rotation = squared[:rows].sum(0), squared[rows:].sum(0)
         done = (translation <= tolerances.position**2) & (rotation <= tolerances.rotation**2)
         size = translation + ROTATION_LENGTH**2 * rotation
         best = np.minimum(best, size)
@@ -64,31 +59,50 @@ def converge_few(
             if not kept.any():
                 break
             rank, best, before, size, now = rank[kept], best[kept], before[kept], size[kept], now[:, kept]
-            error, frames, wanted = error[:, kept], frames[..., kept], wanted[:, kept]
-        jacobian = task.jacobian(torch.from_numpy(few.jacobian(frames)), torch.from_numpy(wanted)).numpy()
-        jacobian[task.dimension :] *= ROTATION_LENGTH
-        error[task.dimension :] *= ROTATION_LENGTH
+            error, frames, targets = error[:, kept], frames[..., kept], targets[:, kept]
+        jacobian = task.jacobian(torch.from_numpy(few.jacobian(frames)), torch.from_numpy(targets)).numpy()
+        jacobian[rows:] *= ROTATION_LENGTH
+        error[rows:] *= ROTATION_LENGTH
         now = _step(limits, now, jacobian, error, 0.5 * DAMPING * size + LEAST_DAMPING)
-    return torch.from_numpy(solved), torch.from_numpy(valid)
+    turns = np.round(solved * (0.5 / math.pi)) * robot.continuous.numpy()[:, None]
+    return solved - (2.0 * math.pi) * turns, valid
 
 
-def _step(limits: Limits | None, q: Array, jacobian: Array, error: Array, damping: Array) -> Array:
+def _step(limits: tuple[Array, Array] | None, q: Array, jacobian: Array, error: Array, damping: Array) -> Array:
     """Configurations (n, M) after a step within limits: `free_step`, and `stop_at_limits` where one is met."""
     step = _damped_least_squares(jacobian, error, damping)
     longest = np.abs(step).max(0)
     if (longest < SHORTEST_STEP).any():
         # at a stationary point, such as a straight arm, any direction may lead on
-        step = np.where(longest < SHORTEST_STEP, nudge(torch.from_numpy(step)).numpy(), step)
+        nudge = 0.05 * np.cos(np.arange(1, len(step) + 1, dtype=step.dtype))[:, None]
+        step = np.where(longest < SHORTEST_STEP, nudge, step)
     moved = q + step * (LONGEST_STEP / np.maximum(longest, LONGEST_STEP))
     if limits is None:
         return moved
-    kept = np.clip(moved, limits.lower.numpy(), limits.upper.numpy())
+    kept = np.clip(moved, *limits)
     stopped = (kept != moved).any(0).nonzero()[0]
     if len(stopped):
-        columns_ = torch.from_numpy(stopped)
-        parts = (torch.from_numpy(np.ascontiguousarray(part[..., stopped])) for part in (q, jacobian, error, damping))
-        redone = stop_at_limits(limits, Equations(columns_, *parts), torch.from_numpy(moved[:, stopped]))
-        kept[:, stopped] = redone.numpy()
+        equations = q[:, stopped], jacobian[..., stopped], error[:, stopped], damping[stopped]
+        kept[:, stopped] = _stop_at_limits(limits, *equations, moved[:, stopped])
+    return kept
+
+
+def _stop_at_limits(
+    limits: tuple[Array, Array], q: Array, jacobian: Array, error: Array, damping: Array, moved: Array
+) -> Array:
+    """`stop_at_limits` for arrays."""
+    kept = np.clip(moved, *limits)
+    stopped = kept != moved
+    for _ in range(len(q)):
+        held = np.where(stopped, kept - q, 0.0).astype(q.dtype)
+        rest = error - (jacobian * held).sum(1)
+        step = held + _damped_least_squares(jacobian * ~stopped, rest, damping)
+        moved = q + step * (LONGEST_STEP / np.maximum(np.abs(step).max(0), LONGEST_STEP))
+        kept = np.clip(moved, *limits)
+        beyond = (kept != moved) & ~stopped
+        if not beyond.any():
+            break
+        stopped |= beyond
     return kept
 
 

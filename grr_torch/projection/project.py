@@ -14,7 +14,7 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import are_few, one_thread, piece, slices
-from grr_torch.projection.few import converge_few
+from grr_torch.projection.few import project_few
 from grr_torch.projection.step import (
     DAMPING,
     FALLEN,
@@ -129,13 +129,13 @@ def project_columns(
     if q.shape[1] == 0:
         return q.clone(), torch.zeros(0, dtype=torch.bool, device=q.device)
     with torch.no_grad(), one_thread():
-        limits = Limits.of(robot)
         if are_few(q):
-            solved, valid = converge_few(robot, task, tolerances, limits, targets, q)
+            found = project_few(robot, task, tolerances, targets.numpy(), q.numpy())
+            solved, valid = (torch.from_numpy(part) for part in found)
         else:
             workspace = robot.tree.workspace(q, min(q.shape[1], piece(q.device)))
-            solved, valid = _Projection(robot, task, tolerances, limits, workspace).converge(targets, q)
-        solved = normalise(solved, robot.continuous[:, None])
+            solved, valid = _Projection(robot, task, tolerances, Limits.of(robot), workspace).converge(targets, q)
+            solved = normalise(solved, robot.continuous[:, None])
         if check_collision and robot.spheres is not None:
             converged = valid.nonzero()[:, 0]
             hit = robot.columns_in_self_collision(solved.index_select(1, converged))

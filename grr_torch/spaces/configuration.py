@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from grr_torch.pieces import Array
 
 
 def wrap(angle: Tensor) -> Tensor:
@@ -52,3 +55,10 @@ def average(sums: Tensor, continuous: Tensor) -> Tensor:
     """
     first, second = sums.chunk(2, dim=-1)
     return torch.where(continuous, torch.atan2(second, first), first / second)
+
+
+def average_of_few(sums: Array, continuous: Array) -> Array:
+    """`average` for arrays."""
+    first, second = np.split(sums, 2, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(continuous, np.arctan2(second, first), first / second)
