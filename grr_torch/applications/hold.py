@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import torch
-from torch import Tensor
 
+from grr_torch.applications.lines import Follower, norms
 from grr_torch.applications.solve import Solver
-from grr_torch.spaces.configuration import distance
+from grr_torch.pieces import Array, Mask
 
 # metres around the last such point that are searched in a step, and the shares of it that are tried
 _AROUND = 0.2
@@ -28,9 +29,14 @@ _STRETCHED = 0.5
 _ITERATIONS = 5
 # a vertex is gone to instead when it is so much nearer, as a share of the distance
 _NEARER = 0.8
+# of the directions across
+_ANGLES = np.arange(_SIDES)[:, None] * (2.0 * math.pi / _SIDES)
+_COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 
 
-def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def nearest_feasible(
+    follower: Follower, solver: Solver, base: Array, base_q: Array, targets: Array
+) -> tuple[Array, Array, Mask]:
     """One step of a search for the solvable point nearest to each target.
 
     Points round the last one found are solved, towards the target and across. The nearest to the target is taken if the
@@ -38,6 +44,7 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     as on the other side of a hole, that is taken.
 
     Args:
+        follower: What arms follow lines with.
         solver: The roadmap's solver.
         base: (B, width) points found in the last step, or where the tools are.
         base_q: (B, n) configurations there; NaN where none is known.
@@ -46,58 +53,62 @@ def nearest_feasible(solver: Solver, base: Tensor, base_q: Tensor, targets: Tens
     Returns:
         Points (B, width), configurations (B, n), and which targets the map solves (B,).
     """
-    count = len(base)
-    apart = (targets - base).norm(dim=1).clamp_max(_AROUND)
+    apart = np.minimum(norms(targets - base), _AROUND)
     directions = apart[:, None, None] * _directions(targets - base)
-    steps = torch.cat([share * directions for share in _SHARES], dim=1)
-    points = torch.cat([base[:, None], base[:, None] + steps, targets[:, None]], dim=1)
+    around = [base[:, None] + share * directions for share in _SHARES]
+    points = np.concatenate([base[:, None], *around, targets[:, None]], axis=1)
     # as long as the arm can stay where it is, only what is nearer to the target can be better
-    known = base_q.isfinite().all(1)
-    left = (points - targets[:, None]).norm(dim=2)
+    known = norms(base_q) < np.inf
+    left = norms(points - targets[:, None])
     tried = (left < left[:, :1]) | ~known[:, None]
     tried[:, [0, -1]] = True
-    flat = points[tried]
-    guesses, codes = solver.guess(flat.to(torch.float64), certified=False)
-    guesses = guesses.to(flat)
-    columns, codes = solver.solve_from(
-        flat.T.contiguous(), guesses, codes, replace(solver.tolerances, iterations=_ITERATIONS)
-    )
-    q = points.new_full((*points.shape[:2], solver.robot.n), torch.nan)
-    q[tried] = columns.T
-    fits, solved = torch.zeros_like(tried), torch.zeros_like(tried)
-    solved[tried] = codes <= 1
+    solved, fits = np.zeros_like(tried), np.zeros_like(tried)
+    q = np.full((*tried.shape, base_q.shape[1]), np.nan, base.dtype)
+    q[tried], solved[tried], strayed = _solve(follower, solver, points[tried])
     # near full stretch, much joint motion brings little
-    fits[tried] = solved[tried] & (distance(columns.T, guesses, solver.robot.continuous) <= _STRETCHED)
-    reach = _SLOPE * (points - base[:, None]).norm(dim=2) + _LEAST
-    moved = torch.where(known[:, None], distance(q, base_q[:, None].nan_to_num(), solver.robot.continuous), 0.0)
+    fits[tried] = solved[tried] & (strayed <= _STRETCHED)
+    reach = _SLOPE * norms(points - base[:, None]) + _LEAST
+    moved = np.where(known[:, None], follower.distance(q, np.nan_to_num(base_q)[:, None]), 0.0)
     fits &= moved <= reach
-    score = torch.where(fits, left + _WORTH * moved, torch.inf)
-    best = score.argmin(1)
-    rows = torch.arange(count, device=base.device)
-    found, found_q = points[rows, best], q[rows, best]
+    score = np.where(fits, left + _WORTH * moved, np.inf)
+    rows, best = np.arange(len(base)), score.argmin(1)
     # a point that the map no longer solves is better than none
-    kept = ~score[rows, best].isfinite() & known
-    found, found_q = torch.where(kept[:, None], base, found), torch.where(kept[:, None], base_q, found_q)
-    distances, vertices = solver.nearest(targets)
-    lost = ~found_q.isfinite().all(1)
-    over = lost | (distances[:, 0] < _NEARER * (found - targets).norm(dim=1))
-    found = torch.where(over[:, None], solver.points[vertices[:, 0]], found)
-    found_q = torch.where(over[:, None], solver.configurations[vertices[:, 0]], found_q)
+    kept = np.expand_dims(known & ~np.isfinite(score[rows, best]), 1)
+    found, found_q = np.where(kept, base, points[rows, best]), np.where(kept, base_q, q[rows, best])
+    distances, vertices = (part[:, 0].numpy() for part in solver.nearest(torch.from_numpy(targets)))
+    lost = ~np.isfinite(found_q).all(1)
+    over = np.expand_dims(lost | (distances < _NEARER * norms(found - targets)), 1)
+    found = np.where(over, solver.points.numpy()[vertices], found)
+    found_q = np.where(over, solver.configurations.numpy()[vertices], found_q)
     return found, found_q, solved[:, -1]
 
 
-def _directions(towards: Tensor) -> Tensor:
+def _solve(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Mask, Array]:
+    """Configurations (N, n) of the map at points (N, width), which are valid, and how far their guesses were off."""
+    guesses, codes = solver.guess(torch.from_numpy(points).to(torch.float64), certified=False)
+    guesses = guesses.to(solver.points.dtype)
+    tolerances = replace(solver.tolerances, iterations=_ITERATIONS)
+    columns, codes = solver.solve_from(torch.from_numpy(points.T), guesses, codes, tolerances)
+    q = columns.T.numpy()
+    return q, codes.numpy() <= 1, follower.distance(q, guesses.numpy())
+
+
+def _directions(towards: Array) -> Array:
     """Unit directions (B, K, d): towards a target, and across, leaning to and from it."""
-    ahead = torch.nn.functional.normalize(towards, dim=1)
+    ahead = _unit(towards)
     if towards.shape[1] == 2:
-        side = torch.stack([-ahead[:, 1], ahead[:, 0]], dim=1)
-        sides = torch.stack([side, -side], dim=1)
+        side = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+        sides = np.stack([side, -side], axis=1)
     else:
         # any axis that is not parallel
-        axis = torch.nn.functional.one_hot(ahead.abs().argmin(1), 3).to(ahead)
-        first = torch.nn.functional.normalize(torch.linalg.cross(ahead, axis), dim=1)
-        second = torch.linalg.cross(ahead, first)
-        angles = torch.arange(_SIDES, dtype=ahead.dtype, device=ahead.device)[:, None] * (2.0 * math.pi / _SIDES)
-        sides = angles.cos() * first[:, None] + angles.sin() * second[:, None]
-    leaning = [torch.nn.functional.normalize(sides + lean * ahead[:, None], dim=2) for lean in _LEANS]
-    return torch.cat([ahead[:, None], *leaning], dim=1)
+        axis = np.eye(3)[np.abs(ahead).argmin(1)]
+        first = _unit(np.cross(ahead, axis))
+        second = np.cross(ahead, first)
+        sides = _COSINES * first[:, None] + _SINES * second[:, None]
+    leaning = [_unit(sides + lean * ahead[:, None]) for lean in _LEANS]
+    return np.concatenate([ahead[:, None], *leaning], axis=1).astype(towards.dtype)
+
+
+def _unit(vectors: Array) -> Array:
+    """Vectors (…, d) of length one; those without a length as they are."""
+    return vectors / np.maximum(norms(vectors), 1e-12)[..., None]

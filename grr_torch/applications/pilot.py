@@ -121,9 +121,8 @@ class Pilot:
         # what is not to be gone to by any route must not be where a jump leads
         near = unset & arms.barred_from(which, targets, _SAME_GOAL)
         base_q = np.where(near[:, None], arms.q[which], arms.held_q[which])
-        tensors = (torch.from_numpy(array) for array in (base, base_q, targets))
-        found = nearest_feasible(self.solver, *tensors)
-        arms.held[which], arms.held_q[which], solved = (part.numpy() for part in found)
+        found = nearest_feasible(self.follower, self.solver, base, base_q, targets)
+        arms.held[which], arms.held_q[which], solved = found
         return solved
 
     def _indirect(self, arms: Arms, which: Array, targets: Array, valid: Mask, ends: Array) -> Steps:
