@@ -125,11 +125,7 @@ class Teleoperator:
     @property
     def configuration(self) -> Tensor | None:
         """(*batch, n) where the arms are, as last commanded or reset; None before the first target where none is."""
-        return (
-            None
-            if self._arms is None
-            else torch.from_numpy(self._arms.q.reshape(*self._batch, self.roadmap.robot.n).copy())
-        )
+        return None if self._arms is None else self._shaped(self._arms.q)
 
     def reset(self, configuration: Tensor | None = None) -> None:
         """Starts anew: the next target is taken wherever it is, and no input is too old.
@@ -202,9 +198,11 @@ class Teleoperator:
         unknown = (~(norms(points) < np.inf)).nonzero()[0]
         if len(unknown):
             arms.look(self._follower, unknown)
-        return Command(
-            torch.from_numpy(q.reshape(*self._batch, self.roadmap.robot.n).copy()), STATUSES[codes].reshape(self._batch)
-        )
+        return Command(self._shaped(q), STATUSES[codes].reshape(self._batch))
+
+    def _shaped(self, q: Array) -> Tensor:
+        """Configurations (B, n) as (*batch, n), a copy."""
+        return torch.from_numpy(q.reshape(*self._batch, self.roadmap.robot.n).copy())
 
     def _start(self, batch: torch.Size, targets: Array) -> None:
         """Arms at their first targets."""

@@ -1,0 +1,120 @@
+"""What relaxation is made of: hops lower slopes, and blending keeps every edge and most of what was gained."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import grr_torch
+from grr_torch.progress import silent
+from grr_torch.projection.continuity import is_continuous
+from grr_torch.projection.project import Tolerances, project
+from grr_torch.resolution.auto_seeds import find_seeds
+from grr_torch.resolution.blend import without_losses
+from grr_torch.resolution.checkpoint import UNKEPT
+from grr_torch.resolution.edges import check_edges
+from grr_torch.resolution.hops import hop
+from grr_torch.resolution.relax import Network
+from grr_torch.spaces.configuration import distance
+from grr_torch.spaces.graph import staggered_grid
+
+
+def network(roadmap: grr_torch.Roadmap) -> Network:
+    """Of a roadmap all of whose vertices are resolved."""
+    points, edges = roadmap.points, roadmap.edges
+    lengths = roadmap.task.distance(points[edges[:, 0]], points[edges[:, 1]])
+    return Network(roadmap.robot, roadmap.task, points.T.contiguous(), edges.T.contiguous(), lengths)
+
+
+@pytest.fixture(scope="module")
+def whole(planar_5) -> grr_torch.Roadmap:
+    roadmap = grr_torch.build(planar_5, grr_torch.Position(2), points=150, bounds=[(-0.35, 0.35)] * 2, seeds="auto")
+    assert bool(roadmap.resolved.all())
+    return roadmap
+
+
+def spoilt(roadmap: grr_torch.Roadmap, share: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    """Its configurations with a share of them replaced by unrelated valid ones, and which."""
+    chosen = torch.rand(len(roadmap.points), generator=generator) < share
+    start = roadmap.robot.sample(len(roadmap.points), generator)
+    other, valid = project(roadmap.robot, roadmap.task, roadmap.points, start)
+    chosen &= valid
+    return torch.where(chosen[:, None], other, roadmap.configurations), chosen
+
+
+def test_hops_lower_slopes_and_stay_on_the_task(whole, generator):
+    q, _ = spoilt(whole, 0.1, generator)
+    net, everywhere = network(whole), torch.ones(len(q), dtype=torch.bool)
+    moved = hop(net, q.T.contiguous(), everywhere, Tolerances())
+    changed = (q != moved.T).any(1)
+    assert bool(changed.any())
+    assert not bool(changed[whole.edges].all(1).any()), "two neighbours hopped at once"
+    assert float(net.costs(moved)) < float(net.costs(q.T))
+    position = whole.robot.forward_kinematics(moved.T)[0][:, :2]
+    assert float((position - whole.points).norm(dim=1).max()) <= 1e-4
+
+
+def test_hops_heal_vertices_that_have_unrelated_configurations(whole, generator):
+    q, wrong = spoilt(whole, 0.05, generator)
+    net, everywhere = network(whole), torch.ones(len(q), dtype=torch.bool)
+    healed = q.T.contiguous()
+    for _ in range(6):
+        healed = hop(net, healed, everywhere, Tolerances())
+    assert float(net.costs(healed)) < 1.02 * float(net.costs(whole.configurations.T))
+    far = distance(q, whole.configurations, whole.robot.continuous)[wrong] > 1.0
+    assert bool(far.any())
+    assert float(distance(healed.T, whole.configurations, whole.robot.continuous)[wrong][far].median()) < 0.5
+
+
+def test_only_active_vertices_hop(whole, generator):
+    q, wrong = spoilt(whole, 0.2, generator)
+    moved = hop(network(whole), q.T.contiguous(), ~wrong, Tolerances())
+    assert torch.equal(moved.T[wrong], q[wrong])
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 1.0])
+def test_no_edge_is_lost_whatever_the_new_configurations_are(whole, generator, share):
+    q, wrong = spoilt(whole, share, generator)
+    blended = without_losses(whole, q, Tolerances(), is_continuous, silent, UNKEPT)
+    assert bool((blended.connected | ~whole.connected).all())
+    assert torch.equal(check_edges(blended, Tolerances()), blended.connected)
+    # what lies far from those that are wrong is as it was asked for
+    touched = wrong.clone()
+    for _ in range(4):
+        touched[whole.edges[touched[whole.edges].any(1)]] = True
+    assert torch.equal(blended.configurations[~touched], q[~touched])
+
+
+def test_what_would_lose_an_edge_goes_part_of_the_way(whole, generator):
+    # one edge is said to be broken at the new configurations until its ends are nearer to where they were
+    edge = int(whole.connected.nonzero()[len(whole.connected) // 3])
+    ends = whole.edges[edge]
+    shifted = whole.configurations + 0.05 * torch.randn(whole.configurations.shape, generator=generator).to(
+        torch.float64
+    )
+    q, valid = project(whole.robot, whole.task, whole.points, shifted)
+    q = torch.where(valid[:, None], q, whole.configurations)
+    apart = distance(q, whole.configurations, whole.robot.continuous)
+
+    def check(robot, task, points_a, points_b, q_a, q_b, *, tolerances):
+        result = is_continuous(robot, task, points_a, points_b, q_a, q_b, tolerances=tolerances)
+        mine = (points_a == whole.points[ends[0]]).all(1) & (points_b == whole.points[ends[1]]).all(1)
+        strayed = distance(q_a, whole.configurations[ends[0]], robot.continuous) > 0.7 * apart[ends[0]]
+        return result & ~(mine & strayed)
+
+    blended = without_losses(whole, q, Tolerances(), check, silent, UNKEPT)
+    moved = distance(blended.configurations, whole.configurations, whole.robot.continuous)
+    assert bool(blended.connected[edge])
+    assert 0.0 < float(moved[ends[0]]) <= 0.7 * float(apart[ends[0]])
+
+
+def test_a_relaxed_map_seeds_all_its_vertices(planar_5):
+    task, graph = grr_torch.Position(2), staggered_grid([(-0.35, 0.35)] * 2, 150)
+    seeds = find_seeds(planar_5, task, graph, candidates=12, tolerances=Tolerances())
+    tools = planar_5.forward_kinematics(seeds)[0][:, :2]
+    assert len(seeds) == len(graph.points)
+    torch.testing.assert_close(tools, graph.points, atol=2e-4, rtol=0)
+    roadmap = grr_torch.build(planar_5, task, points=graph, seeds=seeds, refine=False)
+    kept = distance(roadmap.configurations, seeds, planar_5.continuous)
+    assert float(kept.max()) < 1e-3
+    assert int(roadmap.wave.max()) == 0
