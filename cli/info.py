@@ -56,7 +56,7 @@ def info(
     passed = all(check.passed for check in checks)
     robot = roadmap.robot
     if as_json:
-        parameters = {name: value for name, value in roadmap.parameters.items() if name != "seeds"}
+        seeds = roadmap.parameters.get("seeds", ())
         data = {
             **quality,
             "build_seconds": roadmap.build_seconds,
@@ -64,7 +64,7 @@ def info(
             "tool": robot.tool,
             "base": robot.base,
             "task": metadata["task"],
-            "parameters": {**parameters, "seeds": len(roadmap.parameters.get("seeds", ()))},
+            "parameters": {**roadmap.parameters, "seeds": seeds if isinstance(seeds, str) else len(seeds)},
             "format_version": metadata["format_version"],
             "package_version": metadata.get("package_version"),
         }

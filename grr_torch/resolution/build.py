@@ -119,6 +119,8 @@ def build(
     if kept.roadmap is not None:
         return load_roadmap(kept.roadmap, robot)
     require_memory(robot, problem, refine)
+    # where seeds are found, these say what they are found from: the seeds themselves may be as many as the vertices
+    found = {"seeds": "auto", "candidates": candidates} if isinstance(problem.seeds, str) else {}
     with kept.timed("building"):
         if method == "random":
             parts = _at_random(robot, problem, samples, seed, tolerances, progress, kept)
@@ -126,7 +128,7 @@ def build(
             problem = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
             parts = _expanded(robot, problem, neighbours, tolerances, check, progress, kept)
     settings = {"margin": robot.margin, "seed": seed, "reachability": reachability, "tolerances": asdict(tolerances)}
-    parameters = {"method": method, **parts.chosen, **settings}
+    parameters = {"method": method, **parts.chosen, **(found if method == "expansion" else {}), **settings}
     roadmap = _assemble(robot, problem, parts, parameters, kept.seconds("building"))
     if refine:
         roadmap = refine_roadmap(
