@@ -26,8 +26,11 @@ _HOPELESS = 1.4
 # how much a pull counts against an edge of typical weight
 _WEIGHT = 3.0
 _DAMPING = 0.3
-# rounds in which, of what is left, the worst are given up
-_SACRIFICES = (6, 10, 14)
+# after so many rounds in which the number of uncertified cells has not fallen to this share of itself, the worst of
+# what is left are given up; so many times, and then all of it
+_PATIENCE = 2
+_FALLEN = 0.99
+_SACRIFICES = 3
 
 
 def certify(
@@ -71,11 +74,14 @@ def _drawn_together(
     network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress, kept: Stage
 ) -> Tensor:
     """Configurations (n, V) of the round after which the fewest of some cells were uncertified."""
-    best, fewest, begin = q, torch.inf, 0
+    best, begin = q, 0
     given_up = torch.zeros(len(corners), dtype=torch.bool, device=q.device)
+    # the fewest uncertified cells so far; how many there were when patience began, rounds since, and sacrifices so far
+    counts = torch.tensor([torch.inf, torch.inf, 0.0, 0.0], dtype=torch.float64)
     if state := kept.state():
         q, best, given_up = (state[name].to(q.device) for name in ("q", "best", "given_up"))
-        fewest, begin = float(state["fewest"]), int(state["done"])
+        counts, begin = state["counts"], int(state["done"])
+    fewest, before, waited, sacrifices = counts.tolist()
     weight = _WEIGHT * float((1.0 / network.lengths).mean())
     for done in range(begin, _ROUNDS):
         progress("certifying", done, _ROUNDS)
@@ -83,9 +89,13 @@ def _drawn_together(
         uncertified = int((spread > LARGEST_SPREAD).sum())
         if uncertified < fewest:
             best, fewest = q, uncertified
-        excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
-        if done in _SACRIFICES:
+        before, waited = (uncertified, 0) if uncertified < _FALLEN * before else (before, waited + 1)
+        if waited == _PATIENCE:
+            if sacrifices == _SACRIFICES:
+                break
             given_up |= _worst_of_neighbours(network, corners, spread)
+            sacrifices, waited = sacrifices + 1, 0
+        excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
         pulled = ((excess > 0.0) & ((spread <= _HOPELESS) & ~given_up).repeat(3)).nonzero()[:, 0]
         if len(pulled) == 0:
             break
@@ -93,15 +103,13 @@ def _drawn_together(
         share = excess[pulled] / (excess[pulled] + _AIM)
         pulls = Pulls(pairs[:, pulled], apart[:, pulled] * share, torch.full_like(share, weight * (1 + done)))
         q = move(network, q, gauss_newton_step(network, q, _DAMPING, pulls), tolerances)
-        kept.keep(_state(q, best, given_up, fewest, done + 1))
-    kept.keep(_state(q, best, given_up, fewest, _ROUNDS), last=True)
+        counts = torch.tensor([fewest, before, waited, sacrifices], dtype=torch.float64)
+        kept.keep({"q": q, "best": best, "given_up": given_up, "counts": counts, "done": torch.tensor(done + 1)})
     spread = _spread(network, corners, q, tolerances)[0]
-    return q if int((spread > LARGEST_SPREAD).sum()) < fewest else best
-
-
-def _state(q: Tensor, best: Tensor, given_up: Tensor, fewest: float, done: int) -> dict[str, Tensor]:
-    numbers = {"fewest": torch.tensor(fewest, dtype=torch.float64), "done": torch.tensor(done)}
-    return {"q": q, "best": best, "given_up": given_up, **numbers}
+    result = q if int((spread > LARGEST_SPREAD).sum()) < fewest else best
+    state = {"q": q, "best": result, "given_up": given_up, "counts": counts, "done": torch.tensor(_ROUNDS)}
+    kept.keep(state, last=True)
+    return result
 
 
 def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> Tensor:
