@@ -33,9 +33,10 @@ class Outlook:
             clock: Gives the time [s].
         """
         self._plan, self._clock = list(plan), clock
-        self._begin = self._entered = clock()
+        self._entered = clock()
         self._at = -1
-        self._share = 0.0
+        # how far the present stage is, and how far it was when it was entered: some are done in part before
+        self._share = self._since = 0.0
         self._seconds: dict[int, float] = {}
 
     def __call__(self, stage: str, done: int, total: int) -> None:
@@ -48,14 +49,10 @@ class Outlook:
             if found is None:
                 return
             now = self._clock()
-            if current is not None:
+            if current is not None and self._since < _TELLING:
                 self._seconds[self._at] = now - self._entered
-            self._at, self._entered = found, now
+            self._at, self._entered, self._since = found, now, share
         self._share = share
-
-    def elapsed(self) -> float:
-        """Seconds since the start."""
-        return self._clock() - self._begin
 
     def left(self) -> float | None:
         """Seconds that the current stage and those ahead will take; None while there is nothing to tell by."""
@@ -63,16 +60,17 @@ class Outlook:
             return None
         weight = self._plan[self._at][1]
         spent = self._clock() - self._entered
+        done = self._share - self._since
         weights = sum(self._plan[at][1] for at in self._seconds)
         if weights:
             per_weight = sum(self._seconds.values()) / weights
-        elif self._share > 0.0:
-            per_weight = spent / (self._share * weight)
+        elif done > 0.0:
+            per_weight = spent / (done * weight)
         else:
             return None
-        whole = spent / self._share if self._share >= _TELLING else max(spent, per_weight * weight)
+        per_share = spent / done if done >= _TELLING else per_weight * weight
         ahead = (self._expected(at, per_weight) for at in range(self._at + 1, len(self._plan)))
-        return max(0.0, whole - spent) + sum(ahead)
+        return per_share * (1.0 - self._share) + sum(ahead)
 
     def _expected(self, at: int, per_weight: float) -> float:
         """Seconds of a stage ahead."""

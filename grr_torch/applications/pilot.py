@@ -26,7 +26,7 @@ _SAME_GOAL = 0.03
 _MOST_DOUBT = 32
 # edges that an arm avoids before it gives a goal up
 _MOST_AVOIDED = 8
-# the most that a guess is expected to be off by [rad]
+# the most that a guess is expected to be off by [rad]; less than what the solver calls off the map
 _OFFSET = 0.3
 # more than any distance of configurations [rad]
 _NOT_JOINED = 1e3

@@ -20,6 +20,7 @@ from grr_torch.errors import ParameterError, SeedError, check_seed
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project_columns, tool_points
+from grr_torch.resolution.edges import EDGES_AT_ONCE
 from grr_torch.resolution.expand import default_neighbours, grow
 from grr_torch.resolution.reachability import from_random_starts, within_reach
 from grr_torch.resolution.relax import Network, relax
@@ -111,8 +112,12 @@ def find_seeds(
         tried.append(_relaxed(robot, task, graph, expanded, tolerances, _FINAL_ROUNDS))
     progress("choosing seeds", 3, 3)
     maps = torch.cat(tried)
-    chosen = maps[int(_costs(robot, task, graph, maps, _broken(robot, task, graph, maps, tolerances)).argmin())]
-    return chosen[~chosen.isnan().any(1)]
+    slopes = _slopes(robot, task, graph, maps)
+    slopes[_broken(robot, task, graph, maps, slopes, tolerances)] = torch.nan
+    best = maps[int(_sums(slopes).argmin())]
+    found = best[~best.isnan().any(1)]
+    # on a graph with few vertices within reach none may have been placed
+    return found if len(found) else finalists[0]
 
 
 def _coarse(task: TaskSpace, graph: TaskGraph, points: int) -> TaskGraph:
@@ -246,12 +251,15 @@ def _turned(task: TaskSpace, points: Tensor, axis: Tensor, origin: Tensor, angle
     return torch.cat([moved, task.rotations.turned(points[:, d:], axis, angle)], dim=1)
 
 
-def _costs(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, broken: Tensor | None = None) -> Tensor:
-    """(C,) sums of slopes over all edges of a graph, of maps (C, V, n); what is missing or broken counts as steep."""
-    slopes = _slopes(robot, task, graph, maps)
+def _costs(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Tensor:
+    """(C,) sums of slopes over all edges of a graph, of maps (C, V, n); what is missing counts as steep."""
+    return _sums(_slopes(robot, task, graph, maps))
+
+
+def _sums(slopes: Tensor) -> Tensor:
+    """(C,) sums of slopes (C, E); what is NaN counts as steep."""
     limit = _MISSING * slopes.nanmedian(dim=1).values.nan_to_num(torch.inf).amin()
-    worst = slopes.isnan() if broken is None else slopes.isnan() | broken
-    return torch.where(worst, limit, slopes.clamp(max=limit)).sum(1)
+    return torch.where(slopes.isnan(), limit, slopes.clamp(max=limit)).sum(1)
 
 
 def _slopes(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Tensor:
@@ -261,15 +269,16 @@ def _slopes(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Te
     return distance(maps[:, first], maps[:, second], robot.continuous) / task.distance(points[first], points[second])
 
 
-def _broken(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tolerances: Tolerances) -> Tensor:
-    """(C, E) edges of maps (C, V, n) that are steep and not continuous."""
-    slopes = _slopes(robot, task, graph, maps)
+def _broken(
+    robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, slopes: Tensor, tolerances: Tolerances
+) -> Tensor:
+    """(C, E) edges of maps (C, V, n), with slopes (C, E), that are steep and not continuous."""
     broken = slopes > _SUSPECT * slopes.nanmedian(dim=1, keepdim=True).values
-    which, edges = broken.nonzero().T
-    first, second = graph.edges.to(maps.device)[edges].unbind(1)
     points = graph.points.to(maps)
-    ends = points[first], points[second], maps[which, first], maps[which, second]
-    broken[which, edges] = ~is_continuous(robot, task, *ends, tolerances=tolerances)
+    for which, edges in zip(*(part.split(EDGES_AT_ONCE) for part in broken.nonzero(as_tuple=True)), strict=True):
+        first, second = graph.edges.to(maps.device)[edges].unbind(1)
+        ends = points[first], points[second], maps[which, first], maps[which, second]
+        broken[which, edges] = ~is_continuous(robot, task, *ends, tolerances=tolerances)
     return broken
 
 

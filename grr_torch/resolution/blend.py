@@ -7,12 +7,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from grr_torch.progress import Progress
+from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.edges import EdgeCheck, continuous_edges
 from grr_torch.resolution.roadmap import Roadmap
-from grr_torch.spaces.configuration import difference, normalise
+from grr_torch.spaces.configuration import difference, distance, normalise
 
 # a configuration that would move by less than this share of its way stays where it was
 _LEAST_SHARE = 0.1
@@ -43,25 +43,22 @@ def without_losses(
     """
     robot, task, points, resolved = roadmap.robot, roadmap.task, roadmap.points, roadmap.resolved
 
-    def check_edges(configurations: Tensor, which: Tensor, kept: Stage = UNKEPT) -> Tensor:
-        edges = roadmap.edges[which]
-        return continuous_edges(
-            robot, task, points, configurations, resolved, edges, tolerances, progress, kept, check
-        ).cpu()
+    def check_edges(configurations: Tensor, which: Tensor, progress: Progress = silent, kept: Stage = UNKEPT) -> Tensor:
+        found = configurations, resolved, roadmap.edges[which]
+        return continuous_edges(robot, task, points, *found, tolerances, progress, kept, check).cpu()
 
-    connected = torch.zeros_like(roadmap.connected)
-    stale = torch.ones_like(connected)
+    every = torch.ones_like(roadmap.connected)
+    connected = check_edges(configurations, every, progress, kept)
     blended, share = configurations.clone(), resolved.to(configurations.dtype)
-    claimed, doubted = roadmap.connected, False
+    claimed, settled = roadmap.connected.clone(), torch.zeros_like(every)
     while True:
-        connected[stale] = check_edges(blended, stale, kept)
-        kept = UNKEPT
-        lost = claimed & ~connected
         unmoved = ~(share > 0.0)[roadmap.edges].any(1)
-        if not doubted and bool((lost & unmoved).any()):
+        doubtful = claimed & ~connected & unmoved & ~settled
+        if bool(doubtful.any()):
             # either they were called connected and are not, or they barely passed and come out otherwise in another
-            # batch: all of them at once tell which
-            claimed, doubted = claimed & check_edges(roadmap.configurations, torch.ones_like(stale)), True
+            # batch: all edges at once, as they were checked before, tell which
+            claimed[doubtful] = check_edges(roadmap.configurations, every)[doubtful]
+            settled |= doubtful
         connected[unmoved] = claimed[unmoved]
         ends = roadmap.edges[claimed & ~connected].unique()
         if len(ends) == 0:
@@ -71,7 +68,10 @@ def without_losses(
         share[share < _LEAST_SHARE] = 0.0
         blended[back], there = _part_way(roadmap, configurations, back, share[back], tolerances)
         share[back[~there]] = 0.0
-        stale = torch.isin(roadmap.edges, back).any(1)
+        changed = torch.zeros_like(resolved)
+        changed[back] = True
+        stale = changed[roadmap.edges].any(1)
+        connected[stale] = check_edges(blended, stale)
 
 
 def _part_way(
@@ -85,5 +85,5 @@ def _part_way(
     targets = roadmap.points[vertices].to(robot.lower).T.contiguous()
     solved, valid = project_columns(robot, roadmap.task, targets, guesses.to(robot.lower).T.contiguous(), tolerances)
     found = solved.T.to(before)
-    there = valid.cpu() & (share > 0.0) & ((found - guesses).square().sum(1) <= _NEAR**2)
+    there = valid.cpu() & (share > 0.0) & (distance(guesses, found, wraps) <= _NEAR)
     return torch.where(there[:, None], found, before), there

@@ -119,16 +119,17 @@ def build(
     if kept.roadmap is not None:
         return load_roadmap(kept.roadmap, robot)
     require_memory(robot, problem, refine)
-    # where seeds are found, these say what they are found from: the seeds themselves may be as many as the vertices
-    found = {"seeds": "auto", "candidates": candidates} if isinstance(problem.seeds, str) else {}
     with kept.timed("building"):
         if method == "random":
             parts = _at_random(robot, problem, samples, seed, tolerances, progress, kept)
         else:
-            problem = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
-            parts = _expanded(robot, problem, neighbours, tolerances, check, progress, kept)
+            seeded = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
+            parts = _expanded(robot, seeded, neighbours, tolerances, check, progress, kept)
+            # where seeds are found, what from: they may be as many as the vertices
+            found = isinstance(problem.seeds, str)
+            parts.chosen.update({"seeds": "auto", "candidates": candidates} if found else {"seeds": _rows(problem)})
     settings = {"margin": robot.margin, "seed": seed, "reachability": reachability, "tolerances": asdict(tolerances)}
-    parameters = {"method": method, **parts.chosen, **(found if method == "expansion" else {}), **settings}
+    parameters = {"method": method, **parts.chosen, **settings}
     roadmap = _assemble(robot, problem, parts, parameters, kept.seconds("building"))
     if refine:
         roadmap = refine_roadmap(
@@ -269,11 +270,15 @@ def _expanded(
     found = expansion.configurations, expansion.resolved
     stage = kept.stage("edges")
     connected = continuous_edges(robot, task, graph.points, *found, graph.edges, tolerances, progress, stage, check)
-    chosen = {
-        "neighbours": default_neighbours(task) if neighbours is None else neighbours,
-        "seeds": torch.as_tensor(table, dtype=torch.float64).tolist(),
-    }
+    chosen = {"neighbours": default_neighbours(task) if neighbours is None else neighbours}
     return _Parts(expansion.configurations, expansion.wave, connected, chosen)
+
+
+def _rows(problem: Problem) -> list[list[float]]:
+    """Its seeds, as JSON."""
+    assert not isinstance(problem.seeds, str)
+    rows: list[list[float]] = torch.as_tensor(problem.seeds, dtype=torch.float64).tolist()
+    return rows
 
 
 def _assemble(robot: Robot, problem: Problem, parts: _Parts, parameters: dict[str, Any], seconds: float) -> Roadmap:

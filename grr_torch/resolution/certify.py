@@ -6,6 +6,8 @@ move the place. Where several neighbours share a twist that none can lose, the w
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -64,9 +66,9 @@ def certify(
         if uncertified_before == 0:
             return q
         moved = _drawn_together(network, suspects, q, tolerances, progress, kept)
+        progress("certifying", _ROUNDS, _ROUNDS)
         # cells that were not looked at may have suffered
         after, _ = count_uncertified(moved, looking_again)
-    progress("certifying", _ROUNDS, _ROUNDS)
     return moved if after < uncertified_before else q
 
 
@@ -76,40 +78,35 @@ def _drawn_together(
     """Configurations (n, V) of the round after which the fewest of some cells were uncertified."""
     best, begin = q, 0
     given_up = torch.zeros(len(corners), dtype=torch.bool, device=q.device)
-    # the fewest uncertified cells so far; how many there were when patience began, rounds since, and sacrifices so far
-    counts = torch.tensor([torch.inf, torch.inf, 0.0, 0.0], dtype=torch.float64)
+    # uncertified cells: the fewest so far, and how many there were when patience began; rounds since, and sacrifices
+    fewest, before, waited, sacrifices = math.inf, math.inf, 0, 0
     if state := kept.state():
         q, best, given_up = (state[name].to(q.device) for name in ("q", "best", "given_up"))
-        counts, begin = state["counts"], int(state["done"])
-    fewest, before, waited, sacrifices = counts.tolist()
+        fewest, before = (float(state[name]) for name in ("fewest", "before"))
+        begin, waited, sacrifices = (int(state[name]) for name in ("done", "waited", "sacrifices"))
     weight = _WEIGHT * float((1.0 / network.lengths).mean())
-    for done in range(begin, _ROUNDS):
+    for done in range(begin, _ROUNDS + 1):
         progress("certifying", done, _ROUNDS)
         spread, pairs, apart = _spread(network, corners, q, tolerances)
         uncertified = int((spread > LARGEST_SPREAD).sum())
         if uncertified < fewest:
             best, fewest = q, uncertified
         before, waited = (uncertified, 0) if uncertified < _FALLEN * before else (before, waited + 1)
-        if waited == _PATIENCE:
-            if sacrifices == _SACRIFICES:
-                break
+        if waited == _PATIENCE and sacrifices < _SACRIFICES:
             given_up |= _worst_of_neighbours(network, corners, spread)
             sacrifices, waited = sacrifices + 1, 0
         excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
         pulled = ((excess > 0.0) & ((spread <= _HOPELESS) & ~given_up).repeat(3)).nonzero()[:, 0]
-        if len(pulled) == 0:
+        if done == _ROUNDS or uncertified == 0 or waited == _PATIENCE or len(pulled) == 0:
             break
         # only what is beyond the aim is drawn in
         share = excess[pulled] / (excess[pulled] + _AIM)
         pulls = Pulls(pairs[:, pulled], apart[:, pulled] * share, torch.full_like(share, weight * (1 + done)))
         q = move(network, q, gauss_newton_step(network, q, _DAMPING, pulls), tolerances)
-        counts = torch.tensor([fewest, before, waited, sacrifices], dtype=torch.float64)
-        kept.keep({"q": q, "best": best, "given_up": given_up, "counts": counts, "done": torch.tensor(done + 1)})
-    spread = _spread(network, corners, q, tolerances)[0]
-    result = q if int((spread > LARGEST_SPREAD).sum()) < fewest else best
-    state = {"q": q, "best": result, "given_up": given_up, "counts": counts, "done": torch.tensor(_ROUNDS)}
-    kept.keep(state, last=True)
-    return result
+        numbers = {"fewest": fewest, "before": before, "waited": waited, "sacrifices": sacrifices, "done": done + 1}
+        tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
+        kept.keep({"q": q, "best": best, "given_up": given_up, **tensors}, last=done + 1 == _ROUNDS)
+    return best
 
 
 def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
 # edges that are checked together
-_AT_ONCE = 16384
+EDGES_AT_ONCE = 16384
 
 # `is_continuous`, or what gives the same by other means, and may say by `at_once` how many edges it takes together
 EdgeCheck = Callable[..., Tensor]
@@ -65,7 +65,7 @@ def continuous_edges(
     state = kept.state()
     if state:
         connected = state["connected"].to(robot.device)
-    at_once = getattr(check, "at_once", _AT_ONCE)
+    at_once = getattr(check, "at_once", EDGES_AT_ONCE)
     for start in range(int(state["done"]) if state else 0, len(candidates), at_once):
         progress("checking edges", start, len(candidates))
         part = candidates[start : start + at_once]

@@ -47,7 +47,7 @@ def pose_problem(
     """
     problem = _complete(robot, task, points, bounds, seeds, rotations)
     check_task(robot, problem.task)
-    _check_reach(robot, problem.task, problem.graph)
+    _check_reach(robot, problem.task, problem.graph, warn=not isinstance(points, TaskGraph))
     return problem
 
 
@@ -79,8 +79,8 @@ def check_task(robot: Robot, task: TaskSpace) -> None:
         raise ParameterError("task", given, f"two axes for {robot.name}, whose tool stays in a plane")
 
 
-def _check_reach(robot: Robot, task: TaskSpace, graph: TaskGraph) -> None:
-    """Warns where next to nothing of a graph lies within the arm's reach.
+def _check_reach(robot: Robot, task: TaskSpace, graph: TaskGraph, *, warn: bool) -> None:
+    """Warns, if asked to, where next to nothing of a graph lies within the arm's reach.
 
     Raises:
         ParameterError: Nothing does.
@@ -90,7 +90,7 @@ def _check_reach(robot: Robot, task: TaskSpace, graph: TaskGraph) -> None:
     place = ", ".join(f"{value:.3f}" for value in centre.tolist())
     if inside == 0:
         raise ParameterError("bounds", "no point within reach", f"points within {radius:.3f} m of ({place})")
-    if inside < 0.02 * len(graph.points):
+    if warn and inside < 0.02 * len(graph.points):
         text = f"only {inside} of {len(graph.points)} points lie within {radius:.3f} m of ({place}), the arm's reach"
         warnings.warn(f"{text}: are the bounds in metres?", GrrWarning, stacklevel=4)
 

@@ -120,7 +120,8 @@ class Network:
 
     def motions(self, q: Tensor) -> Tensor:
         """(n, E) wrapped differences along the edges."""
-        return in_pieces(lambda ends: (self._between(q, ends),), self.edges)[0]
+        wraps = self.robot.continuous[:, None]
+        return in_pieces(lambda ends: (difference(q[:, ends[0]], q[:, ends[1]], wraps),), self.edges)[0]
 
     def costs(self, q: Tensor) -> Tensor:
         """(P,) sums of D_q / D_p, rounded off at zero, by part, and of the objectives' costs, for (n, V)."""
@@ -149,11 +150,6 @@ class Network:
     def part_of_vertex(self) -> Tensor:
         """(V,) number of the part that a vertex belongs to."""
         return torch.zeros_like(self.targets[0], dtype=torch.long) if self.parts is None else self.parts
-
-    def _between(self, q: Tensor, ends: Tensor) -> Tensor:
-        """(n, M) wrapped differences between the columns that `ends` (2, M) are."""
-        first, second = ends
-        return difference(q[:, first], q[:, second], self.robot.continuous[:, None])
 
 
 class Pulls(NamedTuple):
