@@ -10,7 +10,7 @@ from torch import Tensor
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
-from grr_torch.resolution.edges import EdgeCheck, continuous_edges
+from grr_torch.resolution.edges import EdgeCheck, check_edges, continuous_edges
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.spaces.configuration import difference, distance, normalise
 
@@ -43,21 +43,20 @@ def without_losses(
     """
     robot, task, points, resolved = roadmap.robot, roadmap.task, roadmap.points, roadmap.resolved
 
-    def check_edges(configurations: Tensor, which: Tensor, progress: Progress = silent, kept: Stage = UNKEPT) -> Tensor:
-        found = configurations, resolved, roadmap.edges[which]
+    def continuous(which: Tensor, progress: Progress = silent, kept: Stage = UNKEPT) -> Tensor:
+        found = blended, resolved, roadmap.edges[which]
         return continuous_edges(robot, task, points, *found, tolerances, progress, kept, check).cpu()
 
-    every = torch.ones_like(roadmap.connected)
-    connected = check_edges(configurations, every, progress, kept)
     blended, share = configurations.clone(), resolved.to(configurations.dtype)
-    claimed, settled = roadmap.connected.clone(), torch.zeros_like(every)
+    connected = continuous(torch.ones_like(roadmap.connected), progress, kept)
+    claimed, settled = roadmap.connected.clone(), torch.zeros_like(connected)
     while True:
         unmoved = ~(share > 0.0)[roadmap.edges].any(1)
         doubtful = claimed & ~connected & unmoved & ~settled
         if bool(doubtful.any()):
             # either they were called connected and are not, or they barely passed and come out otherwise in another
             # batch: all edges at once, as they were checked before, tell which
-            claimed[doubtful] = check_edges(roadmap.configurations, every)[doubtful]
+            claimed[doubtful] = check_edges(roadmap, tolerances)[doubtful]
             settled |= doubtful
         connected[unmoved] = claimed[unmoved]
         ends = roadmap.edges[claimed & ~connected].unique()
@@ -71,7 +70,7 @@ def without_losses(
         changed = torch.zeros_like(resolved)
         changed[back] = True
         stale = changed[roadmap.edges].any(1)
-        connected[stale] = check_edges(blended, stale)
+        connected[stale] = continuous(stale)
 
 
 def _part_way(

@@ -97,16 +97,22 @@ def _drawn_together(
             sacrifices, waited = sacrifices + 1, 0
         excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
         pulled = ((excess > 0.0) & ((spread <= _HOPELESS) & ~given_up).repeat(3)).nonzero()[:, 0]
+        numbers = {"fewest": fewest, "before": before, "waited": waited, "sacrifices": sacrifices}
         if done == _ROUNDS or uncertified == 0 or waited == _PATIENCE or len(pulled) == 0:
+            # gone on from, it ends at once
+            kept.keep(_state(q, best, given_up, {**numbers, "done": _ROUNDS}), last=True)
             break
         # only what is beyond the aim is drawn in
         share = excess[pulled] / (excess[pulled] + _AIM)
         pulls = Pulls(pairs[:, pulled], apart[:, pulled] * share, torch.full_like(share, weight * (1 + done)))
         q = move(network, q, gauss_newton_step(network, q, _DAMPING, pulls), tolerances)
-        numbers = {"fewest": fewest, "before": before, "waited": waited, "sacrifices": sacrifices, "done": done + 1}
-        tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
-        kept.keep({"q": q, "best": best, "given_up": given_up, **tensors}, last=done + 1 == _ROUNDS)
+        kept.keep(_state(q, best, given_up, {**numbers, "done": done + 1}))
     return best
+
+
+def _state(q: Tensor, best: Tensor, given_up: Tensor, numbers: dict[str, float]) -> dict[str, Tensor]:
+    tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
+    return {"q": q, "best": best, "given_up": given_up, **tensors}
 
 
 def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> Tensor:
