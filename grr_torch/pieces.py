@@ -16,7 +16,7 @@ Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[np.bool_]
 
 # configurations worked on together: few enough for the cache, enough that a torch call costs less than its arithmetic
-_ON_CPU = 3500
+_ON_CPU = 6000
 _ON_GPU = 1 << 18
 # up to so many, on the CPU, the number of calls is the cost, not the arithmetic
 FEW = 300

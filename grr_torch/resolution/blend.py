@@ -55,8 +55,8 @@ def without_losses(
         doubtful = claimed & ~connected & unmoved & ~settled
         if bool(doubtful.any()):
             # either they were called connected and are not, or they barely passed and come out otherwise in another
-            # batch: all edges at once, as they were checked before, tell which
-            claimed[doubtful] = check_edges(roadmap, tolerances)[doubtful]
+            # batch: they are told apart in the batches in which all edges are checked
+            claimed[doubtful] = check_edges(roadmap, tolerances, wanted=doubtful)[doubtful]
             settled |= doubtful
         connected[unmoved] = claimed[unmoved]
         ends = roadmap.edges[claimed & ~connected].unique()

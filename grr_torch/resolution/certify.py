@@ -57,37 +57,50 @@ def certify(
     looking, kept, looking_again = map(checkpoint.stage, ("spread", "certification", "spread-again"))
     robot, task, points = network.robot, network.task, network.targets.T
 
-    def count_uncertified(q: Tensor, stage: Stage) -> tuple[int, Tensor]:
+    def measure(q: Tensor, stage: Stage) -> tuple[Tensor, int]:
         spread = spreads(robot, task, points, q.T, corners, tolerances, progress, stage)
-        return int((spread > LARGEST_SPREAD).sum()), corners[spread > _SUSPECT]
+        return spread, int((spread > LARGEST_SPREAD).sum())
 
     with one_thread(), torch.no_grad():
-        uncertified_before, suspects = count_uncertified(q, looking)
-        if uncertified_before == 0:
+        spread, before = measure(q, looking)
+        if before == 0:
             return q
-        moved = _drawn_together(network, suspects, q, tolerances, progress, kept)
+        suspects = spread > _SUSPECT
+        moved = _drawn_together(network, corners[suspects], spread[suspects], q, tolerances, progress, kept)
         progress("certifying", _ROUNDS, _ROUNDS)
         # cells that were not looked at may have suffered
-        after, _ = count_uncertified(moved, looking_again)
-    return moved if after < uncertified_before else q
+        _, after = measure(moved, looking_again)
+    return moved if after < before else q
 
 
 def _drawn_together(
-    network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances, progress: Progress, kept: Stage
+    network: Network,
+    corners: Tensor,
+    spread: Tensor,
+    q: Tensor,
+    tolerances: Tolerances,
+    progress: Progress,
+    kept: Stage,
 ) -> Tensor:
-    """Configurations (n, V) of the round after which the fewest of some cells were uncertified."""
+    """Configurations (n, V) of the round after which the fewest of some cells, of known spread, were uncertified."""
     best, begin = q, 0
-    given_up = torch.zeros(len(corners), dtype=torch.bool, device=q.device)
+    given_up = torch.zeros_like(spread, dtype=torch.bool)
+    # how far corners have moved since their cells were measured [rad]
+    travelled = torch.zeros_like(spread)
     # uncertified cells: the fewest so far, and how many there were when patience began; rounds since, and sacrifices
     fewest, before, waited, sacrifices = math.inf, math.inf, 0, 0
     if state := kept.state():
-        q, best, given_up = (state[name].to(q.device) for name in ("q", "best", "given_up"))
+        q, best = (state[name].to(q.device) for name in ("q", "best"))
+        given_up, spread, travelled = (state[name].to(q.device) for name in ("given_up", "spread", "travelled"))
         fewest, before = (float(state[name]) for name in ("fewest", "before"))
         begin, waited, sacrifices = (int(state[name]) for name in ("done", "waited", "sacrifices"))
     weight = _WEIGHT * float((1.0 / network.lengths).mean())
     for done in range(begin, _ROUNDS + 1):
         progress("certifying", done, _ROUNDS)
-        spread, pairs, apart = _spread(network, corners, q, tolerances)
+        # the others cannot have come to where they are pulled, or no longer are
+        again = (2.0 * travelled >= _leeway(spread)).nonzero()[:, 0]
+        spread[again], pairs, apart = _spread(network, corners[again], q, tolerances)
+        travelled[again] = 0.0
         uncertified = int((spread > LARGEST_SPREAD).sum())
         if uncertified < fewest:
             best, fewest = q, uncertified
@@ -96,23 +109,32 @@ def _drawn_together(
             given_up |= _worst_of_neighbours(network, corners, spread)
             sacrifices, waited = sacrifices + 1, 0
         excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
-        pulled = ((excess > 0.0) & ((spread <= _HOPELESS) & ~given_up).repeat(3)).nonzero()[:, 0]
+        pulled = ((excess > 0.0) & ((spread <= _HOPELESS) & ~given_up)[again].repeat(3)).nonzero()[:, 0]
         numbers = {"fewest": fewest, "before": before, "waited": waited, "sacrifices": sacrifices}
+        watched = {"given_up": given_up, "spread": spread, "travelled": travelled}
         if done == _ROUNDS or uncertified == 0 or waited == _PATIENCE or len(pulled) == 0:
             # gone on from, it ends at once
-            kept.keep(_state(q, best, given_up, {**numbers, "done": _ROUNDS}), last=True)
+            kept.keep(_state(q, best, watched, {**numbers, "done": _ROUNDS}), last=True)
             break
         # only what is beyond the aim is drawn in
         share = excess[pulled] / (excess[pulled] + _AIM)
         pulls = Pulls(pairs[:, pulled], apart[:, pulled] * share, torch.full_like(share, weight * (1 + done)))
-        q = move(network, q, gauss_newton_step(network, q, _DAMPING, pulls), tolerances)
-        kept.keep(_state(q, best, given_up, {**numbers, "done": done + 1}))
+        moved = move(network, q, gauss_newton_step(network, q, _DAMPING, pulls), tolerances)
+        steps = difference(q, moved, network.robot.continuous[:, None]).square().sum(0).sqrt()
+        travelled += steps[corners].amax(1)
+        q = moved
+        kept.keep(_state(q, best, watched, {**numbers, "done": done + 1}))
     return best
 
 
-def _state(q: Tensor, best: Tensor, given_up: Tensor, numbers: dict[str, float]) -> dict[str, Tensor]:
+def _leeway(spread: Tensor) -> Tensor:
+    """How much the spread of cells (C,) would have to change to be drawn together, or not any more [rad]."""
+    return torch.maximum(_AIM - spread, spread - _HOPELESS).clamp_min(0.0)
+
+
+def _state(q: Tensor, best: Tensor, watched: dict[str, Tensor], numbers: dict[str, float]) -> dict[str, Tensor]:
     tensors = {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
-    return {"q": q, "best": best, "given_up": given_up, **tensors}
+    return {"q": q, "best": best, **watched, **tensors}
 
 
 def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> Tensor:
