@@ -168,6 +168,12 @@ class TaskSpace(ABC):
             return jacobian[: 3 + rotation_rows]
         return torch.cat([jacobian[: self.dimension], jacobian[6 - rotation_rows :]])
 
+    def jacobian_of_few(self, jacobian: Array, targets: Array) -> Array:
+        """`jacobian` for arrays; its rows may be those that are given."""
+        if self.dimension == 3 and self.constraints in (3, 6):
+            return jacobian[: self.constraints]
+        return self.jacobian(torch.from_numpy(jacobian), torch.from_numpy(targets)).numpy()
+
     def residuals(self, error: Tensor) -> tuple[Tensor, Tensor]:
         """Norms (N,) of an error's translation [m] and rotation [rad] parts."""
         return error[: self.dimension].norm(dim=0), error[self.dimension :].norm(dim=0)

@@ -107,12 +107,22 @@ def rotation_error(target: Tensor, rotation: Tensor) -> Tensor:
     return error
 
 
-def rotation_error_of_few(target: Array, rotation: Array) -> Array:
-    """`rotation_error` for arrays, of one target (3, 3): a third of its time for a few columns."""
-    turn = (target.astype(rotation.dtype) @ rotation.transpose(1, 0, 2).reshape(3, -1)).reshape(9, -1)
-    twisted = 0.5 * (turn[[7, 2, 3]] - turn[[5, 6, 1]])
-    cosine = 0.5 * (turn[0] + turn[4] + turn[8] - 1.0)
-    if (cosine < -1.0 + max(_HALF_TURN, 8.0 * float(np.finfo(turn.dtype).eps))).any():
+def turning_terms(target: Array) -> Array:
+    """(4, 9) what of the entries of Rᵀ makes axis · sin(angle) and cos(angle) + ½ of T Rᵀ, for one target T (3, 3)."""
+    terms = np.zeros((4, 3, 3), target.dtype)
+    x, y, z = target
+    terms[0, :, 1], terms[0, :, 2] = z, -y
+    terms[1, :, 2], terms[1, :, 0] = x, -z
+    terms[2, :, 0], terms[2, :, 1] = y, -x
+    terms[3] = target.T
+    return 0.5 * terms.reshape(4, 9)
+
+
+def rotation_error_of_few(target: Array, terms: Array, rotation: Array) -> Array:
+    """`rotation_error` for arrays, of one target (3, 3) and its `turning_terms`: a fifth of its time for few columns."""
+    mixed = terms.astype(rotation.dtype, copy=False) @ rotation.transpose(1, 0, 2).reshape(9, -1)
+    twisted, cosine = mixed[:3], mixed[3] - 0.5
+    if cosine.min(initial=1.0) < -1.0 + max(_HALF_TURN, 8.0 * float(np.finfo(rotation.dtype).eps)):
         tensors = torch.from_numpy(target).to(torch.from_numpy(rotation))[..., None], torch.from_numpy(rotation)
         return rotation_error(*tensors).numpy()
     sine = np.sqrt((twisted * twisted).sum(0)) + _TINY

@@ -15,7 +15,7 @@ from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.pieces import Array
 from grr_torch.spaces.base import ROTATION_WEIGHT, TRANSLATION_WEIGHT, TaskSpace
 from grr_torch.spaces.configuration import wrap
-from grr_torch.spaces.rotation import matrix_from_rpy, rotation_error, rotation_error_of_few
+from grr_torch.spaces.rotation import matrix_from_rpy, rotation_error, rotation_error_of_few, turning_terms
 from grr_torch.spaces.turning import Axis, Pose, Yaw
 
 __all__ = [
@@ -82,6 +82,11 @@ class FixedRotation(TaskSpace):
         """The tool's rotation matrix (3, 3)."""
         return matrix_from_rpy(*self.rpy)
 
+    @cached_property
+    def _turning(self) -> tuple[Array, Array]:
+        target = self.rotation.numpy()
+        return target, turning_terms(target)
+
     def matrices(self, targets: Tensor) -> Tensor:
         """The one rotation, for every point."""
         return self.rotation.to(targets)[..., None]
@@ -96,7 +101,7 @@ class FixedRotation(TaskSpace):
         """`rotation_error` for arrays."""
         if self.dimension == 2:
             return super().rotation_error_of_few(targets, rotation)
-        return rotation_error_of_few(self.rotation.numpy(), rotation)
+        return rotation_error_of_few(*self._turning, rotation)
 
     def to_json(self) -> dict[str, Any]:
         """Kind, dimension and angles."""
