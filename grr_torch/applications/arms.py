@@ -25,6 +25,7 @@ class Arms:
         on_task: (B,) arms that meet their task's rotation and the joint limits and are free of self-collision.
         held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
         held_q: (B, n) configurations there.
+        closely: (B,) whether it is next looked for closely round the last one.
         last_vertex: (B,) the last vertex of a route, and
         last_goal: (B, width) the goal it belongs to; NaN where there is none.
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
@@ -42,6 +43,7 @@ class Arms:
     on_task: Mask
     held: Array
     held_q: Array
+    closely: Mask
     last_vertex: Array
     last_goal: Array
     next_vertex: Array
@@ -68,6 +70,7 @@ class Arms:
             on_task=np.zeros(count, dtype=bool),
             held=unknown(width),
             held_q=unknown(n),
+            closely=np.zeros(count, dtype=bool),
             last_vertex=np.full(count, -1),
             last_goal=unknown(width),
             next_vertex=np.full(count, -1),

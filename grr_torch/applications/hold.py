@@ -12,9 +12,9 @@ from grr_torch.applications.lines import Follower, norms
 from grr_torch.applications.solve import Solver
 from grr_torch.pieces import Array, Mask
 
-# metres around the last such point that are searched in a step, and the shares of it that are tried
+# metres around the last such point that are searched in a step, and the share of it in steps that look closely
 _AROUND = 0.2
-_SHARES = (1.0, 0.2)
+_CLOSE = 0.2
 # directions across, in space, and how much they lean to the target
 _SIDES = 6
 _LEANS = (0.5, 0.0)
@@ -35,7 +35,7 @@ _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 
 
 def nearest_feasible(
-    follower: Follower, solver: Solver, base: Array, base_q: Array, targets: Array
+    follower: Follower, solver: Solver, base: Array, base_q: Array, targets: Array, closely: Mask
 ) -> tuple[Array, Array, Mask]:
     """One step of a search for the solvable point nearest to each target.
 
@@ -49,14 +49,15 @@ def nearest_feasible(
         base: (B, width) points found in the last step, or where the tools are.
         base_q: (B, n) configurations there; NaN where none is known.
         targets: (B, width) targets.
+        closely: (B,) whose points are to lie close to the last one. To look far and closely in turn finds as good ones
+            as to do both in each step, in half of the time.
 
     Returns:
         Points (B, width), configurations (B, n), and which targets the map solves (B,).
     """
-    apart = np.minimum(norms(targets - base), _AROUND)
-    directions = apart[:, None, None] * _directions(targets - base)
-    around = [base[:, None] + share * directions for share in _SHARES]
-    points = np.concatenate([base[:, None], *around, targets[:, None]], axis=1)
+    apart = np.minimum(norms(targets - base), _AROUND) * np.where(closely, _CLOSE, 1.0)
+    around = base[:, None] + apart[:, None, None] * _directions(targets - base)
+    points = np.concatenate([base[:, None], around, targets[:, None]], axis=1)
     # as long as the arm can stay where it is, only what is nearer to the target can be better
     known = norms(base_q) < np.inf
     left = norms(points - targets[:, None])

@@ -121,8 +121,10 @@ class Pilot:
         # what is not to be gone to by any route must not be where a jump leads
         near = unset & arms.barred_from(which, targets, _SAME_GOAL)
         base_q = np.where(near[:, None], arms.q[which], arms.held_q[which])
-        found = nearest_feasible(self.follower, self.solver, base, base_q, targets)
+        closely = arms.closely[which] & ~unset
+        found = nearest_feasible(self.follower, self.solver, base, base_q, targets, closely)
         arms.held[which], arms.held_q[which], solved = found
+        arms.closely[which] = ~closely
         return solved
 
     def _indirect(self, arms: Arms, which: Array, targets: Array, valid: Mask, ends: Array) -> Steps:
