@@ -253,20 +253,12 @@ def _task(
     rotation: tuple[float, float, float] | None,
     axis: tuple[float, float, float] | None,
 ) -> Any:
-    """The task space where the options say more than the preset does; else its kind."""
-    from grr_torch.spaces.task import FixedRotation, make_task
+    """The task space that the options and the preset say."""
+    from grr_torch.resolution.problem import complete_task
 
-    preset = arm.preset
-    kind = kind or (preset.default_task if preset else "position" if rotation is None else FixedRotation.kind)
-    if rotation is axis is None and preset is not None and kind in preset.problems and box is None:
-        return kind
-    problem = preset.problems.get(kind) if preset else None
-    sides = box or (problem.bounds if problem else None)
-    if sides is None:
-        return kind
-    if rotation is None and problem is not None and len(problem.bounds) == len(sides):
-        rotation = problem.rotation
-    return make_task(kind, len(sides), rotation, axis)
+    if kind is None and arm.preset is None:
+        kind = "position" if rotation is None else "fixed-rotation"
+    return complete_task(arm, kind, None if box is None else len(box), rpy=rotation, axis=axis)
 
 
 def _bounds(text: str) -> list[tuple[float, float]]:

@@ -58,7 +58,7 @@ def test_what_is_said_but_holds_anyway_does_not_change_the_hash(tmp_path, planar
 def test_what_determines_a_roadmap_changes_the_hash(tmp_path):
     said = [
         "seed: 0", "seed: 1", "points: 70", "task: fixed-rotation", "task: fixed-rotation, rotation: [0, 0, 1]",
-        "refine: false", "objectives: {limits: 1}", "objectives: {limits: 2}", "tool: link_3",
+        "refine: false", "objectives: {manipulability: 1}", "objectives: {manipulability: 2}", "tool: link_3",
         "held_joints: {joint_2: 0.1}",
         "seeds: auto", "seeds: [[0, 0.1, 0.1, 0.1, 0.1]]", "bounds: [[0, 0.2], [0, 0.2]]", "device: cuda",
     ]  # fmt: skip
@@ -95,6 +95,18 @@ def test_files_count_by_what_is_in_them(tmp_path):
         ("builds: [{robot: planar_5, margin: .nan}]", "margin: got nan"),
         ("builds: [{robot: planar_5, bounds: [[0, 1, 2], [0, 1]]}]", "bounds: got"),
         ("builds: [{robot: planar_5, objectives: {clearance: a}}]", "objectives: got"),
+        ("builds: [{robot: planar_5, objectives: {clearance: -1}}]", "weight of clearance: got -1"),
+        ("builds: [{robot: planar_5, points: 0}]", "points: got 0; valid: a whole number from 1"),
+        ("builds: [{robot: planar_5, seed: -1}]", "seed: got -1"),
+        ("builds: [{robot: planar_5, candidates: 0}]", "candidates: got 0"),
+        ("builds: [{robot: planar_5, samples: 0}]", "samples: got 0"),
+        ("builds: [{robot: planar_5, reachability: -1}]", "reachability: got -1"),
+        ("builds: [{robot: planar_5, method: expand}]", "Did you mean 'expansion'?"),
+        ("builds: [{robot: planar_5, task: pose, neighbours: 4}]", "neighbours: got 4; valid: 1 to 3 edges"),
+        ("builds: [{robot: planar_5, task: pose, rotations: 0}]", "rotations: got 0"),
+        ("builds: [{robot: planar_5, task: position, rotations: 3}]", "rotations: got 3; valid: none"),
+        ("builds: [{robot: planar_5, bounds: [[1, 0], [0, 1]]}]", "bounds: got ((1.0, 0.0), (0.0, 1.0))"),
+        ("builds: [{robot: planar_5, seeds: [[0, 0]]}]", "seeds have shape (1, 2)"),
         ("builds: [{robot: planar_5, task: rotate}]", "Did you mean 'fixed-rotation'?"),
         ("builds: [{robot: planar_5, task: position, rotation: [0, 0, 1]}]", "none for the task 'position'"),
         ("builds: [{robot: planar_5, seeds: none.csv}]", "none.csv: cannot be read"),

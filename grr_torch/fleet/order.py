@@ -12,11 +12,13 @@ from typing import Any
 
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.fleet.options import check_option, known_options, of_owner
+from grr_torch.resolution.options import check_options
+from grr_torch.resolution.problem import complete_task
 from grr_torch.resolution.roadmap_file import FORMAT_VERSION
 from grr_torch.resolution.seeds import read_seeds
 from grr_torch.robots.load import load_robot
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.task import TaskSpace, make_task
+from grr_torch.spaces.task import TaskSpace
 from grr_torch.version import __version__
 
 # hexadecimal digits of a hash that name a file
@@ -110,6 +112,8 @@ class Planner:
         options = self._with_contents({name: value for name, value in options.items() if value is not None})
         robot = self._robot(options)
         task = make_order_task(robot, options)
+        defaults = {name: option.default for name, option in known_options().items() if option.owner == "build"}
+        check_options(robot, task, defaults | of_owner("build", options))
         return Order(_digest(robot, task, options), robot.name, task.kind, _orientation(task), options, needs)
 
     def _with_contents(self, options: dict[str, Any]) -> dict[str, Any]:
@@ -136,26 +140,15 @@ class Planner:
 
 
 def make_order_task(robot: Robot, options: Mapping[str, Any]) -> TaskSpace:
-    """The task space of a build, with what its options leave open taken from the robot's preset.
+    """The task space of a build, completed as `complete_task` does it.
 
     Raises:
         ParameterError: No task is given, there is no preset that has one, or what is said of it excludes itself.
         UnknownNameError: No such task.
     """
-    preset = robot.preset
-    kind = options.get("task") or (preset.default_task if preset else None)
-    if kind is None:
-        raise ParameterError("task", "nothing", f"the kind of a task: {robot.name} has no preset")
-    problem = preset.problems.get(kind) if preset else None
-    sides = options.get("bounds") or (problem.bounds if problem else None)
-    if sides is None:
-        if preset is not None:
-            raise UnknownNameError("task", kind, tuple(preset.problems))
-        raise ParameterError("bounds", "nothing", f"(low, high) of each axis: {robot.name} has no preset")
-    said = of_owner("task", options)
-    if problem is not None and problem.rotation is not None and len(problem.bounds) == len(sides):
-        said = {"rpy": problem.rotation, **said}
-    return make_task(kind, len(sides), **said)
+    sides = options.get("bounds")
+    axes = None if sides is None else len(sides)
+    return complete_task(robot, options.get("task"), axes, **of_owner("task", options))
 
 
 def _digest(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> str:

@@ -62,6 +62,16 @@ _MISSING = 40.0
 _SUSPECT = 2.0
 
 
+def check_candidates(candidates: int) -> None:
+    """Checks how many sets of seeds are to be compared.
+
+    Raises:
+        ParameterError: It is out of its range.
+    """
+    if isinstance(candidates, bool) or not isinstance(candidates, int) or not 1 <= candidates <= _MOST_CANDIDATES:
+        raise ParameterError("candidates", candidates, f"a whole number from 1 to {_MOST_CANDIDATES:,}")
+
+
 def find_seeds(
     robot: Robot,
     task: TaskSpace,
@@ -87,8 +97,7 @@ def find_seeds(
         ParameterError: `candidates` is out of its range.
         SeedError: No point of the graph is reached from random starts.
     """
-    if isinstance(candidates, bool) or not isinstance(candidates, int) or not 1 <= candidates <= _MOST_CANDIDATES:
-        raise ParameterError("candidates", candidates, f"a whole number from 1 to {_MOST_CANDIDATES:,}")
+    check_candidates(candidates)
     generator = torch.Generator().manual_seed(check_seed(seed))
     anchors = -(-candidates // (2 * _MEDOIDS))
     points, medoids, share = _medoids(robot, task, graph, anchors, generator, tolerances)

@@ -4,36 +4,33 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError, UnknownNameError, check_seed
+from grr_torch.errors import ParameterError
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
 from grr_torch.resolution.auto_seeds import CANDIDATES, find_seeds
-from grr_torch.resolution.checkpoint import Checkpoint, digest
+from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.edges import EdgeCheck, continuous_edges
 from grr_torch.resolution.expand import default_neighbours, expand
 from grr_torch.resolution.memory import require_memory
-from grr_torch.resolution.objectives import check_objectives
+from grr_torch.resolution.options import check_options, describe_build
 from grr_torch.resolution.problem import Problem, pose_problem
 from grr_torch.resolution.random_grr import random_grr
 from grr_torch.resolution.reachability import measure_reachability
 from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
-from grr_torch.resolution.roadmap_file import load_roadmap, robot_to_json
-from grr_torch.resolution.seeds import SeedsLike, check_seeds
+from grr_torch.resolution.roadmap_file import load_roadmap
+from grr_torch.resolution.seeds import SeedsLike
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph
 from grr_torch.spaces.task import TaskSpace
-from grr_torch.tensor_file import tensor_hash
-from grr_torch.version import __version__
-
-_MOST_STARTS = 100_000
 
 
 def build(
@@ -111,67 +108,42 @@ def build(
         "seed": seed,
         "tolerances": asdict(tolerances),
     }
-    _check_options(robot, options)
+    check_options(robot, problem.task, options)
     if resume and checkpoint is None:
         raise ParameterError("resume", resume, "with a checkpoint to resume from")
     what = None if checkpoint is None else describe_build(robot, problem, options)
-    kept = Checkpoint(checkpoint, what, resume)
-    if kept.roadmap is not None:
-        return load_roadmap(kept.roadmap, robot)
-    require_memory(robot, problem, refine)
-    with kept.timed("building"):
-        if method == "random":
-            parts = _at_random(robot, problem, samples, seed, tolerances, progress, kept)
-        else:
-            seeded = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
-            parts = _expanded(robot, seeded, neighbours, tolerances, check, progress, kept)
-            # where seeds are found, what from: they may be as many as the vertices
-            found = isinstance(problem.seeds, str)
-            parts.chosen.update({"seeds": "auto", "candidates": candidates} if found else {"seeds": _rows(problem)})
-    settings = {"margin": robot.margin, "seed": seed, "reachability": reachability, "tolerances": asdict(tolerances)}
-    parameters = {"method": method, **parts.chosen, **settings}
-    roadmap = _assemble(robot, problem, parts, parameters, kept.seconds("building"))
-    if refine:
-        roadmap = refine_roadmap(
-            roadmap, objectives=objectives, seed=seed, check=check, progress=progress, checkpoint=kept
-        )
-    if reachability:
-        roadmap = _with_reachability(roadmap, tolerances, progress, kept)
-    if kept.folder is not None:
-        roadmap.triangles(progress, kept.stage("triangles"))
-        roadmap.squares(progress, kept.stage("squares"))
-        kept.finish(roadmap.save)
-    return roadmap
-
-
-def _check_options(robot: Robot, options: Mapping[str, Any]) -> None:
-    """Checks what `build` is asked for, whatever the problem.
-
-    Raises:
-        ParameterError: A parameter is out of its range, or does not go with another.
-        UnknownNameError: No such method or objective.
-    """
-    check_seed(options["seed"])
-    objectives, reachability, method = (options[name] for name in ("objectives", "reachability", "method"))
-    check_objectives(robot, objectives)
-    if objectives and not options["refine"]:
-        raise ParameterError("objectives", tuple(objectives), "none without refinement, which serves them")
-    if not 0 <= reachability <= _MOST_STARTS:
-        raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
-    if method not in ("expansion", "random"):
-        raise UnknownNameError("method", method, ("expansion", "random"))
-
-
-def describe_build(robot: Robot, problem: Problem, options: Mapping[str, Any]) -> dict[str, Any]:
-    """All that determines a build, by name, as JSON: what is long, by its SHA-256."""
-    arm = {
-        name: value for name, value in robot_to_json(robot).items() if name not in ("urdf_directory", "package_dirs")
-    }
-    seeds = problem.seeds if isinstance(problem.seeds, str) else tensor_hash(check_seeds(robot, problem.seeds).cpu())
-    graph = {"points": tensor_hash(problem.graph.points), "edges": tensor_hash(problem.graph.edges)}
-    packages = {"grr-torch": __version__, "torch": torch.__version__, "device": robot.device.type}
-    what = {"robot": robot.name, "arm": digest(arm), "task": problem.task.to_json(), **graph, "seeds": seeds}
-    return {**packages, **what, **options}
+    with closing(Checkpoint(checkpoint, what, resume)) as kept:
+        if kept.roadmap is not None:
+            return load_roadmap(kept.roadmap, robot)
+        require_memory(robot, problem, refine)
+        with kept.timed("building"):
+            if method == "random":
+                parts = _at_random(robot, problem, samples, seed, tolerances, progress, kept)
+            else:
+                seeded = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
+                parts = _expanded(robot, seeded, neighbours, tolerances, check, progress, kept)
+                # where seeds are found, what from: they may be as many as the vertices
+                found = isinstance(problem.seeds, str)
+                parts.chosen.update({"seeds": "auto", "candidates": candidates} if found else {"seeds": _rows(problem)})
+        settings = {
+            "margin": robot.margin,
+            "seed": seed,
+            "reachability": reachability,
+            "tolerances": asdict(tolerances),
+        }
+        parameters = {"method": method, **parts.chosen, **settings}
+        roadmap = _assemble(robot, problem, parts, parameters, kept.seconds("building"))
+        if refine:
+            roadmap = refine_roadmap(
+                roadmap, objectives=objectives, seed=seed, check=check, progress=progress, checkpoint=kept
+            )
+        if reachability:
+            roadmap = _with_reachability(roadmap, tolerances, progress, kept)
+        if kept.folder is not None:
+            roadmap.triangles(progress, kept.stage("triangles"))
+            roadmap.squares(progress, kept.stage("squares"))
+            kept.finish(roadmap.save)
+        return roadmap
 
 
 def _with_reachability(roadmap: Roadmap, tolerances: Tolerances, progress: Progress, kept: Checkpoint) -> Roadmap:

@@ -20,6 +20,11 @@ from typing import Any
 
 from torch import Tensor
 
+try:
+    import fcntl
+except ImportError:  # where there are no POSIX locks, two builds in one folder are not noticed
+    fcntl = None  # type: ignore[assignment]
+
 from grr_torch.errors import FileFormatError, GrrWarning, OutputError
 from grr_torch.output import PARTIAL, atomic_write
 from grr_torch.tensor_file import read_tensors, tensor_hash, write_tensors
@@ -82,7 +87,8 @@ class Checkpoint:
             resume: Whether to go on from what is there.
 
         Raises:
-            OutputError: The folder holds anything and `resume` is false, or it cannot be written.
+            OutputError: The folder holds anything and `resume` is false, another build uses it, or it cannot be
+                written.
             FileFormatError: What is there is no checkpoint, of another build, or corrupt.
         """
         self.folder = None if folder is None else Path(folder)
@@ -92,8 +98,19 @@ class Checkpoint:
         self._seconds: dict[str, float] = {}
         self._running: tuple[str, float] | None = None
         self._due = time.monotonic() + _INTERVAL
+        self._lock: int | None = None
         if self.folder is not None:
-            self._open(self.folder, json.loads(json.dumps(build)), resume)
+            try:
+                self._open(self.folder, json.loads(json.dumps(build)), resume)
+            except BaseException:
+                self.close()
+                raise
+
+    def close(self) -> None:
+        """Lets another build use the folder."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def stage(self, name: str) -> Stage:
         """The next stage; a build asks for the same ones in the same order whenever it runs."""
@@ -154,6 +171,7 @@ class Checkpoint:
     def _open(self, folder: Path, build: dict[str, Any], resume: bool) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(folder)
             partial = set(folder.glob(PARTIAL))  # of a run that was killed
             present = sorted(path.name for path in folder.iterdir() if path not in partial)
         except OSError as error:
@@ -184,6 +202,27 @@ class Checkpoint:
                 warnings.warn(f"{error}; going on from {paths[len(self._found) - 1].name}", GrrWarning, stacklevel=4)
                 return
             self._found[path.name], self._seconds = tensors, json.loads(metadata["seconds"])
+
+
+def _locked(folder: Path) -> int | None:
+    """A handle that keeps other builds out of a folder until it is closed, be it by the end of the process.
+
+    Raises:
+        OutputError: Another build has it.
+    """
+    if fcntl is None:
+        return None
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise OutputError(folder, "another build is using it; valid: another folder, or to wait for its end") from error
+    except OSError:
+        # not every file system knows locks
+        os.close(handle)
+        return None
+    return handle
 
 
 def _read_whole(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:

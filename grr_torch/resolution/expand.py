@@ -79,10 +79,7 @@ def expand(
     """
     if neighbours is None:
         neighbours = default_neighbours(task)
-    if neighbours < 1:
-        raise ParameterError("neighbours", neighbours, "1 or more")
-    if task.rotations is not None and neighbours > MOST_HOPS:
-        raise ParameterError("neighbours", neighbours, f"1 to {MOST_HOPS} edges, as rotation varies")
+    check_neighbours(task, neighbours)
     vertices, placed = place_seeds(robot, task, graph, check_seeds(robot, seeds), tolerances)
     return grow(
         robot,
@@ -95,6 +92,18 @@ def expand(
         progress=progress,
         kept=kept,
     )
+
+
+def check_neighbours(task: TaskSpace, neighbours: int) -> None:
+    """Checks how many of the nearest vertices are to be averaged over, or how many edges away they may be.
+
+    Raises:
+        ParameterError: It is below 1, or above 3 where rotation varies.
+    """
+    if neighbours < 1:
+        raise ParameterError("neighbours", neighbours, "1 or more")
+    if task.rotations is not None and neighbours > MOST_HOPS:
+        raise ParameterError("neighbours", neighbours, f"1 to {MOST_HOPS} edges, as rotation varies")
 
 
 def grow(

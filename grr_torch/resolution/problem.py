@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -49,6 +50,42 @@ def pose_problem(
     check_task(robot, problem.task)
     _check_reach(robot, problem.task, problem.graph, warn=not isinstance(points, TaskGraph))
     return problem
+
+
+def complete_task(
+    robot: Robot,
+    kind: str | None,
+    axes: int | None,
+    *,
+    rpy: Sequence[float] | None = None,
+    axis: Sequence[float] | None = None,
+) -> TaskSpace:
+    """A task space, with what is not given taken from the robot's preset.
+
+    Args:
+        robot: The robot.
+        kind: The kind of task; by default the preset's.
+        axes: Of the grid, 2 or 3; by default as many as the preset has bounds for.
+        rpy: As `make_task` takes it; by default the preset's, if that has as many axes.
+        axis: As `make_task` takes it.
+
+    Raises:
+        UnknownNameError: No such kind, or none that the preset says the bounds of.
+        ParameterError: No kind or no bounds are given and there is no preset, or what is said excludes itself.
+    """
+    preset = robot.preset
+    if kind is None and preset is None:
+        raise ParameterError("task", "nothing", f"{', '.join(KINDS)}: {robot.name} has no preset")
+    kind = kind or (preset.default_task if preset else "")
+    problem = preset.problems.get(kind) if preset else None
+    if axes is None and problem is None:
+        if preset is not None or kind not in KINDS:
+            raise UnknownNameError("task", kind, tuple(preset.problems) if preset else KINDS)
+        raise ParameterError("bounds", "nothing", f"(low, high) of each axis, and points: {robot.name} has no preset")
+    axes = axes or (len(problem.bounds) if problem else 0)
+    if rpy is None and problem is not None and len(problem.bounds) == axes:
+        rpy = problem.rotation
+    return make_task(kind, axes, rpy, axis)
 
 
 def _turned(task: TaskSpace, positions: TaskGraph, rotations: int | None, problem: Preset | None) -> TaskGraph:
@@ -122,10 +159,8 @@ def _complete(
     if isinstance(seeds, str) and seeds != "auto":
         raise UnknownNameError("seeds", seeds, ("auto",), " Or a table of configurations.")
     if not isinstance(task, TaskSpace):
-        if kind is None:
-            raise ParameterError("task", "not given", ", ".join(KINDS))
-        d = graph.positions.points.shape[1] if isinstance(graph, ProductGraph) else graph.points.shape[1]
-        task = make_task(kind, d, problem.rotation if problem else None)
+        positions = graph.positions if isinstance(graph, ProductGraph) else graph
+        task = complete_task(robot, kind, positions.points.shape[1])
     if not isinstance(graph, ProductGraph) and (rotations is not None or task.rotations is not None):
         graph = _turned(task, graph, rotations, problem)
     if graph.points.shape[1] != task.width:

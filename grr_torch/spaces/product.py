@@ -164,6 +164,18 @@ class ProductGraph(TaskGraph):
         return closed(torch.cat([*corners, torch.stack(around, dim=1)]), self.edges[kept], len(self.points))
 
 
+def rotating(task: TaskSpace, rotations: int) -> Rotations:
+    """The space in which a task's rotations vary, of which so many are asked for.
+
+    Raises:
+        ParameterError: They do not vary.
+    """
+    if task.rotations is None:
+        valid = f"none for the task '{task.kind}', in which rotation does not vary"
+        raise ParameterError("rotations", rotations, valid)
+    return task.rotations
+
+
 def product_graph(task: TaskSpace, positions: TaskGraph, rotations: int) -> ProductGraph:
     """The product of a graph of positions and a grid of rotations.
 
@@ -176,11 +188,7 @@ def product_graph(task: TaskSpace, positions: TaskGraph, rotations: int) -> Prod
     Raises:
         ParameterError: Rotation does not vary in the task, or there would be too few or too many vertices.
     """
-    space = task.rotations
-    if space is None:
-        raise ParameterError(
-            "rotations", rotations, f"none for the task '{task.kind}', in which rotation does not vary"
-        )
+    space = rotating(task, rotations)
     grid = space.grid(rotations)
     count, size = len(grid.values), len(positions.points)
     if count * size > MOST_POINTS:

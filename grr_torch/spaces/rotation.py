@@ -119,7 +119,7 @@ def turning_terms(target: Array) -> Array:
 
 
 def rotation_error_of_few(target: Array, terms: Array, rotation: Array) -> Array:
-    """`rotation_error` for arrays, of one target (3, 3) and its `turning_terms`: a fifth of its time for few columns."""
+    """`rotation_error` for arrays, of one target (3, 3) with its `turning_terms`: a fifth of its time."""
     mixed = terms.astype(rotation.dtype, copy=False) @ rotation.transpose(1, 0, 2).reshape(9, -1)
     twisted, cosine = mixed[:3], mixed[3] - 0.5
     if cosine.min(initial=1.0) < -1.0 + max(_HALF_TURN, 8.0 * float(np.finfo(rotation.dtype).eps)):

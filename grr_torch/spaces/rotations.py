@@ -122,7 +122,7 @@ class Yaws(Rotations):
 
     def grid(self, count: int) -> RotationGrid:
         """A ring from 0 in steps of 2π / n."""
-        count = _checked(count)
+        count = check_rotations(count)
         values = wrap(torch.arange(count, dtype=torch.float64)[:, None] * (2.0 * math.pi / count))
         pairs = [(k, k + 1) for k in range(count - 1)] + ([(0, count - 1)] if count > 2 else [])
         return RotationGrid(values, torch.tensor(pairs, dtype=torch.long).reshape(-1, 2))
@@ -169,7 +169,7 @@ class Directions(Rotations):
 
     def grid(self, count: int) -> RotationGrid:
         """A Fibonacci lattice on the sphere."""
-        count = _checked(count)
+        count = check_rotations(count)
         height = 1.0 - (2.0 * np.arange(count) + 1.0) / count
         angle = np.arange(count) * (math.pi * (3.0 - math.sqrt(5.0)))
         radius = np.sqrt(1.0 - height**2)
@@ -213,7 +213,7 @@ class Orientations(Rotations):
 
     def grid(self, count: int) -> RotationGrid:
         """A super-Fibonacci spiral (Alexa 2022)."""
-        count = _checked(count)
+        count = check_rotations(count)
         s = np.arange(count) + 0.5
         low, high = np.sqrt(s / count), np.sqrt(1.0 - s / count)
         alpha, beta = 2.0 * math.pi * s / math.sqrt(2.0), 2.0 * math.pi * s / _PSI
@@ -239,7 +239,7 @@ def _normalised(name: str, rows: Tensor) -> Tensor:
     return rows / lengths
 
 
-def _checked(count: int) -> int:
+def check_rotations(count: int) -> int:
     """The number of rotations asked for.
 
     Raises:

@@ -1,0 +1,81 @@
+"""The options of a build: what they may be, and what of them determines its roadmap."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from grr_torch.errors import ParameterError, UnknownNameError, check_seed
+from grr_torch.resolution.auto_seeds import check_candidates
+from grr_torch.resolution.checkpoint import digest
+from grr_torch.resolution.expand import check_neighbours
+from grr_torch.resolution.objectives import check_objectives
+from grr_torch.resolution.problem import Problem
+from grr_torch.resolution.roadmap_file import robot_to_json
+from grr_torch.resolution.seeds import check_seeds
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.graph import check_bounds, check_count
+from grr_torch.spaces.product import rotating
+from grr_torch.spaces.rotations import check_rotations
+from grr_torch.spaces.task import TaskSpace
+from grr_torch.tensor_file import tensor_hash
+from grr_torch.version import __version__
+
+METHODS = ("expansion", "random")
+_MOST_STARTS = 100_000
+
+
+def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> None:
+    """Checks what `build` is asked for, as far as no grid has to be laid for it.
+
+    Args:
+        robot: The robot.
+        task: The task space.
+        options: Arguments of `build` by their names; of the problem's (points, bounds, rotations, seeds), those there
+            are.
+
+    Raises:
+        ParameterError: A parameter is out of its range, or does not go with another.
+        UnknownNameError: No such method or objective.
+    """
+    check_seed(options["seed"])
+    objectives, reachability, method = (options[name] for name in ("objectives", "reachability", "method"))
+    check_objectives(robot, objectives)
+    if objectives and not options["refine"]:
+        raise ParameterError("objectives", tuple(objectives), "none without refinement, which serves them")
+    if not 0 <= reachability <= _MOST_STARTS:
+        raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
+    if method not in METHODS:
+        raise UnknownNameError("method", method, METHODS)
+    check_candidates(options["candidates"])
+    if options["samples"] < 1:
+        raise ParameterError("samples", options["samples"], "1 or more")
+    if options["neighbours"] is not None:
+        check_neighbours(task, options["neighbours"])
+    _check_problem(robot, task, *(options.get(name) for name in ("points", "bounds", "rotations", "seeds")))
+
+
+def _check_problem(robot: Robot, task: TaskSpace, points: Any, bounds: Any, rotations: Any, seeds: Any) -> None:
+    if isinstance(points, int):
+        check_count(points)
+    if bounds is not None:
+        check_bounds(bounds)
+    if rotations is not None:
+        rotating(task, rotations)
+        check_rotations(rotations)
+    if seeds is not None and not isinstance(seeds, str):
+        check_seeds(robot, seeds)
+
+
+def describe_build(robot: Robot, problem: Problem, options: Mapping[str, Any]) -> dict[str, Any]:
+    """All that determines a build, by name, as JSON: what is long, by its SHA-256."""
+    arm = {
+        name: value for name, value in robot_to_json(robot).items() if name not in ("urdf_directory", "package_dirs")
+    }
+    seeds = problem.seeds if isinstance(problem.seeds, str) else tensor_hash(check_seeds(robot, problem.seeds).cpu())
+    graph = {"points": tensor_hash(problem.graph.points), "edges": tensor_hash(problem.graph.edges)}
+    packages = {"grr-torch": __version__, "torch": torch.__version__, "device": robot.device.type}
+    what = {"robot": robot.name, "arm": digest(arm), "task": problem.task.to_json(), **graph, "seeds": seeds}
+    return {**packages, **what, **options}
