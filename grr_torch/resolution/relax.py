@@ -33,6 +33,8 @@ _HOPS = 5
 # rounds end when one lowers the cost by less than this share
 _LEAST_GAIN = 2e-5
 _GRADIENT_STEPS = 60
+# conjugate gradients end when so much of the squared residual is left: the weights change from round to round
+_LEFT = 1e-3
 # longest step of a joint [rad or m]
 _LONGEST_STEP = 0.3
 # D_q below which a slope counts as none [rad]
@@ -248,7 +250,7 @@ def gauss_newton_step(network: Network, q: Tensor, damping: float | Tensor, pull
     direction = scaled = residual / stiffness
     size = start = (residual * scaled).sum()
     for _ in range(_GRADIENT_STEPS):
-        if float(size) <= 1e-6 * float(start):
+        if float(size) <= _LEFT * float(start):
             break
         applied = apply(direction)
         length = size / (direction * applied).sum()
