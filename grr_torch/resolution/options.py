@@ -15,6 +15,7 @@ from grr_torch.resolution.objectives import check_objectives
 from grr_torch.resolution.problem import Problem
 from grr_torch.resolution.roadmap_file import robot_to_json
 from grr_torch.resolution.seeds import check_seeds
+from grr_torch.resolution.steep import check_max_slope
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import check_bounds, check_count
 from grr_torch.spaces.product import rotating
@@ -49,6 +50,7 @@ def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> 
         raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
     if method not in METHODS:
         raise UnknownNameError("method", method, METHODS)
+    check_max_slope(options["max_slope"])
     check_candidates(options["candidates"])
     if options["samples"] < 1:
         raise ParameterError("samples", options["samples"], "1 or more")
