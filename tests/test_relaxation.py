@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -11,6 +13,8 @@ from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project
 from grr_torch.resolution.auto_seeds import find_seeds
 from grr_torch.resolution.blend import without_losses
+from grr_torch.resolution.cells import spreads
+from grr_torch.resolution.certify import certify
 from grr_torch.resolution.checkpoint import UNKEPT
 from grr_torch.resolution.edges import check_edges
 from grr_torch.resolution.hops import hop
@@ -70,6 +74,38 @@ def test_only_active_vertices_hop(whole, generator):
     q, wrong = spoilt(whole, 0.2, generator)
     moved = hop(network(whole), q.T.contiguous(), ~wrong, Tolerances())
     assert torch.equal(moved.T[wrong], q[wrong])
+
+
+@pytest.mark.parametrize("share", [0.02, 0.2])
+def test_certification_certifies_no_fewer_cells(whole, generator, share):
+    net, cells = network(whole), whole.graph.triangles(whole.connected)
+    q = spoilt(whole, share, generator)[0]
+
+    def spread(q):
+        return spreads(whole.robot, whole.task, whole.points, q, cells, Tolerances())
+
+    moved = certify(net, cells, q.T.contiguous(), Tolerances(), silent).T
+    assert int((spread(moved) > 1.0).sum()) <= int((spread(q) > 1.0).sum())
+    position = whole.robot.forward_kinematics(moved)[0][:, :2]
+    assert float((position - whole.points).norm(dim=1).max()) <= 1e-4
+
+
+def test_cells_that_are_far_apart_are_left_alone(whole, generator):
+    net, cells = network(whole), whole.graph.triangles(whole.connected)
+    q = spoilt(whole, 0.2, generator)[0]
+    apart = cells[spreads(whole.robot, whole.task, whole.points, q, cells, Tolerances()) > 1.5]
+    assert len(apart)
+    assert torch.equal(certify(net, apart, q.T.contiguous(), Tolerances(), silent), q.T)
+
+
+def test_some_edges_are_judged_as_all_of_them_are(whole, generator):
+    q = spoilt(whole, 0.3, generator)[0]
+    torn = replace(whole, configurations=q)
+    wanted = torch.rand(len(whole.edges), generator=generator) < 0.1
+    found = check_edges(torn, Tolerances(), wanted=wanted)
+    assert torch.equal(found, check_edges(torn, Tolerances()) & wanted)
+    assert bool(found.any())
+    assert not bool(found[wanted].all())
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 1.0])
