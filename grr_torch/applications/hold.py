@@ -32,6 +32,8 @@ _NEARER = 0.8
 # of the directions across
 _ANGLES = np.arange(_SIDES)[:, None] * (2.0 * math.pi / _SIDES)
 _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
+# of an axis, the next one and the one before
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 def nearest_feasible(
@@ -103,11 +105,16 @@ def _directions(towards: Array) -> Array:
     else:
         # any axis that is not parallel
         axis = np.eye(3)[np.abs(ahead).argmin(1)]
-        first = _unit(np.cross(ahead, axis))
-        second = np.cross(ahead, first)
+        first = _unit(_cross(ahead, axis))
+        second = _cross(ahead, first)
         sides = _COSINES * first[:, None] + _SINES * second[:, None]
     leaning = [_unit(sides + lean * ahead[:, None]) for lean in _LEANS]
     return np.concatenate([ahead[:, None], *leaning], axis=1).astype(towards.dtype)
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """Cross products (…, 3) of vectors; numpy.cross takes three times as long for a few."""
+    return first[..., _NEXT] * second[..., _LAST] - first[..., _LAST] * second[..., _NEXT]
 
 
 def _unit(vectors: Array) -> Array:

@@ -19,6 +19,8 @@ from grr_torch.pieces import Array, Mask
 # vertices that are tried as the first of a route, as its last, and as a way back to the map
 _ENTRIES = 6
 _ENDS = 8
+# of the latter, those that are tried first
+_LIKELY = 2
 _WAYS_BACK = 32
 # metres that a goal moves before the last vertex of the route to it is looked for again
 _SAME_GOAL = 0.03
@@ -28,8 +30,6 @@ _MOST_DOUBT = 32
 _MOST_AVOIDED = 8
 # the most that a guess is expected to be off by [rad]; less than what the solver calls off the map
 _OFFSET = 0.3
-# more than any distance of configurations [rad]
-_NOT_JOINED = 1e3
 # an arm so near [rad or m] to a vertex's configuration is at the vertex
 _ARRIVED = 1e-6
 # an arm so near [rad or m] to the map's configuration at its place is on the map
@@ -250,17 +250,21 @@ class Pilot:
         Of all of them, where there is no such line.
         """
         vertices = self._nearest(goals, _ENDS)
-        placed = self._placed[vertices]
-        apart = self.follower.distance(placed, goals_q[:, None])
-        count = vertices.shape[1]
-        lines = self.follower.follow(
-            goals_q.repeat(count, 0),
-            goals.repeat(count, 0),
-            placed.reshape(-1, placed.shape[2]),
-            self._points[vertices].reshape(-1, goals.shape[1]),
-        )
-        apart += np.where(lines.direct.reshape(apart.shape), 0.0, _NOT_JOINED)
-        return vertices[np.arange(len(vertices)), apart.argmin(1)]
+        apart = self.follower.distance(self._placed[vertices], goals_q[:, None])
+        vertices = np.take_along_axis(vertices, apart.argsort(1, kind="stable"), axis=1)
+        chosen, left = vertices[:, 0].copy(), np.arange(len(goals))
+        # the first one that is joined is it, and it is seldom far down the list
+        for tried in (vertices[:, :_LIKELY], vertices[:, _LIKELY:]):
+            ends = tried[left]
+            if ends.size == 0:
+                break
+            q, p = (part[left].repeat(ends.shape[1], 0) for part in (goals_q, goals))
+            lines = self.follower.follow(q, p, self._placed[ends.ravel()], self._points[ends.ravel()])
+            joined = lines.direct.reshape(ends.shape)
+            found = joined.any(1)
+            chosen[left[found]] = ends[found, joined[found].argmax(1)]
+            left = left[~found]
+        return chosen
 
     def _back(self, arms: Arms, arm: int, goal_q: Array) -> Array | None:
         """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near."""
