@@ -49,12 +49,6 @@ def build(
             metavar="NAME=WEIGHT",
         ),
     ] = None,
-    max_slope: Annotated[
-        float | None,
-        typer.Option(
-            help="Leave out edges steeper than this, in rad/m, and vertices that have no others; by default none."
-        ),
-    ] = None,
     reachability: Annotated[
         int, typer.Option(help="Random starts per unresolved vertex, to tell which are reachable; 0: not measured.")
     ] = 0,
@@ -118,7 +112,7 @@ def build(
     from grr_torch.resolution.auto_seeds import CANDIDATES
     from grr_torch.resolution.build import build as build_roadmap
     from grr_torch.resolution.problem import pose_problem
-    from grr_torch.resolution.report import left_out, summary, traded
+    from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.stages import build_stages
     from grr_torch.robots.load import load_robot
 
@@ -168,7 +162,6 @@ def build(
                 neighbours=neighbours,
                 refine=refine,
                 objectives=weights,
-                max_slope=max_slope,
                 reachability=reachability,
                 seed=seed,
                 checkpoint=checkpoint,
@@ -195,7 +188,7 @@ def build(
     quality = figures.to_dict()
     if as_json:
         files = {"out": str(out), "record": None if recording is None else str(recording)}
-        told = {name: roadmap.parameters.get(name) for name in ("refinement", "left_out")}
+        told = {"refinement": roadmap.parameters.get("refinement")}
         print_json({**quality, "build_seconds": roadmap.build_seconds, **told, **files})
         return
     rotation = roadmap.task.to_json().get("rotation")
@@ -206,7 +199,6 @@ def build(
     rows = [
         *([("refined", change)] if change else []),
         *traded(roadmap, figures).items(),
-        *([("left out", left_out(roadmap))] if left_out(roadmap) else []),
         ("built in", f"{roadmap.build_seconds:.2f} s (the algorithm alone)"),
         ("written", written),
     ]

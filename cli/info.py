@@ -39,7 +39,7 @@ def info(
     """
     from grr_torch.errors import ParameterError
     from grr_torch.resolution.quality import Quality, steep_edges
-    from grr_torch.resolution.report import left_out, summary, traded
+    from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.roadmap_file import load_roadmap, read_file
     from grr_torch.resolution.verify import verify_file
 
@@ -93,7 +93,6 @@ def info(
         figures = Quality(**{field.name: quality[field.name] for field in fields(Quality)})
         change = summary(roadmap, figures)
         rows += [*([("refined", change)] if change else []), *traded(roadmap, figures).items()]
-        rows += [("left out", left_out(roadmap))] if left_out(roadmap) else []
         print_rows(f"{file}: {robot.name}, {roadmap.task.kind}", rows)
         if len(steep):
             print_rows(f"{len(steep)} steep edges, the steepest first", _steep_rows(roadmap, steep[:_LISTED]))

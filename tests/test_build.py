@@ -187,7 +187,6 @@ def test_seed_files_are_read(tmp_path):
         ({"points": 0}, "points: got 0"),
         ({"neighbours": 0}, "neighbours: got 0"),
         ({"reachability": -1}, "reachability: got -1"),
-        ({"max_slope": 0.0}, "max_slope: got 0.0; valid: above 0, in rad/m"),
         ({"bounds": [(1, -1), (0, 1), (0, 1)]}, "low < high"),
         ({"task": grr_torch.Position(2)}, "2 for R2"),
         (

@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 
 import grr_torch
 from grr_torch.resolution.quality import edge_slopes, steep_edges
-from grr_torch.resolution.steep import without_steep_edges
-from grr_torch.resolution.verify import verify_file
 from grr_torch.spaces.cliques import draw, triangles
 from grr_torch.spaces.graph import TaskGraph, find_lattice, staggered_grid
 
@@ -129,25 +127,6 @@ def test_steep_edges_are_those_above_the_limit_steepest_first(planar_roadmap):
     assert len(steep) == int((slopes > limit).sum())
     assert bool((by_edge[steep].diff() <= 0.0).all())
     assert len(steep_edges(planar_roadmap)) == int((slopes > 10.0 * slopes.median()).sum())
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
-def test_steep_edges_are_left_out_and_vertices_that_had_no_others(planar_roadmap, tmp_path, share):
-    slopes = edge_slopes(planar_roadmap)
-    limit = float(slopes.quantile(share))
-    gentle = without_steep_edges(planar_roadmap, limit)
-    edges = planar_roadmap.connected.nonzero()[:, 0]
-    assert torch.equal(gentle.connected.nonzero()[:, 0], edges[slopes <= limit])
-    with_edges = torch.zeros_like(gentle.resolved)
-    with_edges[gentle.edges[gentle.connected].flatten()] = True
-    assert torch.equal(gentle.resolved, planar_roadmap.resolved & with_edges)
-    assert torch.equal(gentle.configurations.isfinite().all(1), gentle.resolved)
-    assert torch.equal(gentle.configurations[gentle.resolved], planar_roadmap.configurations[gentle.resolved])
-    told = gentle.parameters["left_out"]
-    assert told["edges"] == int((slopes > limit).sum())
-    assert told["vertices"] == (planar_roadmap.resolved & ~with_edges).nonzero()[:, 0].tolist()
-    gentle.save(tmp_path / "gentle.grr")
-    assert all(check.passed for check in verify_file(tmp_path / "gentle.grr"))
 
 
 def test_cells_of_nothing(planar_5):

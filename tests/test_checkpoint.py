@@ -254,6 +254,7 @@ def test_no_space_left_is_a_clear_error_and_what_is_there_is_gone_on_from(planar
     assert equal(again, undisturbed)
 
 
+@pytest.mark.skipif(checkpoints.fcntl is None, reason="no POSIX locks here")
 def test_two_builds_do_not_share_a_folder(planar_5, tmp_path):
     refused = []
 

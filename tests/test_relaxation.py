@@ -11,6 +11,7 @@ import grr_torch
 from grr_torch.progress import silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project
+from grr_torch.resolution import certify as certification
 from grr_torch.resolution.auto_seeds import find_seeds
 from grr_torch.resolution.blend import without_losses
 from grr_torch.resolution.cells import spreads
@@ -18,6 +19,7 @@ from grr_torch.resolution.certify import certify
 from grr_torch.resolution.checkpoint import UNKEPT
 from grr_torch.resolution.edges import check_edges
 from grr_torch.resolution.hops import hop
+from grr_torch.resolution.refine import _network
 from grr_torch.resolution.relax import Network
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import staggered_grid
@@ -76,18 +78,24 @@ def test_only_active_vertices_hop(whole, generator):
     assert torch.equal(moved.T[wrong], q[wrong])
 
 
-@pytest.mark.parametrize("share", [0.02, 0.2])
-def test_certification_certifies_no_fewer_cells(whole, generator, share):
-    net, cells = network(whole), whole.graph.triangles(whole.connected)
-    q = spoilt(whole, share, generator)[0]
+@pytest.mark.parametrize("every_cell_each_round", [False, True])
+def test_certification_certifies_more_cells(planar_5, monkeypatch, every_cell_each_round):
+    if every_cell_each_round:
+        monkeypatch.setattr(certification, "_leeway", torch.zeros_like)
+    plain = grr_torch.build(planar_5, "fixed-rotation", points=400, refine=False)
+    vertices = plain.resolved.nonzero()[:, 0]
+    rank = torch.full_like(plain.resolved, -1, dtype=torch.long).index_put_((vertices,), torch.arange(len(vertices)))
+    net = _network(plain, vertices, rank[plain.edges[plain.connected]], {})
+    cells = rank[plain.graph.triangles(plain.connected)]
 
-    def spread(q):
-        return spreads(whole.robot, whole.task, whole.points, q, cells, Tolerances())
+    def uncertified(q):
+        return int((spreads(planar_5, plain.task, net.targets.T, q, cells, Tolerances()) > 1.0).sum())
 
+    q = plain.configurations[vertices]
     moved = certify(net, cells, q.T.contiguous(), Tolerances(), silent).T
-    assert int((spread(moved) > 1.0).sum()) <= int((spread(q) > 1.0).sum())
-    position = whole.robot.forward_kinematics(moved)[0][:, :2]
-    assert float((position - whole.points).norm(dim=1).max()) <= 1e-4
+    assert uncertified(moved) <= 0.8 * uncertified(q)
+    position = planar_5.forward_kinematics(moved)[0][:, :2]
+    assert float((position - net.targets.T).norm(dim=1).max()) <= 1e-4
 
 
 def test_cells_that_are_far_apart_are_left_alone(whole, generator):
@@ -96,6 +104,11 @@ def test_cells_that_are_far_apart_are_left_alone(whole, generator):
     apart = cells[spreads(whole.robot, whole.task, whole.points, q, cells, Tolerances()) > 1.5]
     assert len(apart)
     assert torch.equal(certify(net, apart, q.T.contiguous(), Tolerances(), silent), q.T)
+
+
+def test_what_may_have_to_be_drawn_together_is_measured_again():
+    spread = torch.tensor([0.5, 0.93, 1.2, 1.4, 2.0, torch.inf])
+    torch.testing.assert_close(certification._leeway(spread), torch.tensor([0.43, 0.0, 0.0, 0.0, 0.6, 0.0]))
 
 
 def test_some_edges_are_judged_as_all_of_them_are(whole, generator):

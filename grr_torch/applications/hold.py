@@ -51,8 +51,8 @@ def nearest_feasible(
         base: (B, width) points found in the last step, or where the tools are.
         base_q: (B, n) configurations there; NaN where none is known.
         targets: (B, width) targets.
-        closely: (B,) whose points are to lie close to the last one. To look far and closely in turn finds as good ones
-            as to do both in each step, in half of the time.
+        closely: (B,) whose points are to lie close to the last one. To look far and closely in turn, step by step, is
+            enough for points that change little, and tries half as many.
 
     Returns:
         Points (B, width), configurations (B, n), and which targets the map solves (B,).

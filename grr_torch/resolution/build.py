@@ -28,7 +28,6 @@ from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.roadmap_file import load_roadmap
 from grr_torch.resolution.seeds import SeedsLike
-from grr_torch.resolution.steep import without_steep_edges
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph
 from grr_torch.spaces.task import TaskSpace
@@ -48,7 +47,6 @@ def build(
     samples: int = 100,
     refine: bool = True,
     objectives: Mapping[str, float] | None = None,
-    max_slope: float | None = None,
     reachability: int = 0,
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
@@ -78,8 +76,6 @@ def build(
         refine: Whether the roadmap is repaired, relaxed and certified after the expansion.
         objectives: Weights of "clearance", "manipulability" and "limits", which refinement serves besides smoothness;
             at weight 1, 1 % of an objective's mean is worth 1 % of smoothness.
-        max_slope: Edges steeper than this [rad/m] are left out in the end, and vertices that have no others; none by
-            default. What was left out is told by the roadmap's parameters, "left_out".
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. On the CPU the same inputs give the same tensors.
         tolerances: When a configuration counts as being at a point.
@@ -98,7 +94,7 @@ def build(
             would not fit the memory that is free.
         SeedError: No seed can be used.
         FileFormatError: The checkpoint is of another build, or corrupt.
-        OutputError: The checkpoint cannot be written, or is there without `resume`.
+        OutputError: The checkpoint cannot be written, is there without `resume`, or another build is using it.
     """
     problem = pose_problem(robot, task, points, bounds, seeds, rotations)
     options: dict[str, Any] = {
@@ -108,7 +104,6 @@ def build(
         "samples": samples,
         "refine": refine,
         "objectives": dict(objectives or {}),
-        "max_slope": max_slope,
         "reachability": reachability,
         "seed": seed,
         "tolerances": asdict(tolerances),
@@ -142,8 +137,6 @@ def build(
             roadmap = refine_roadmap(
                 roadmap, objectives=objectives, seed=seed, check=check, progress=progress, checkpoint=kept
             )
-        if max_slope is not None:
-            roadmap = without_steep_edges(roadmap, max_slope)
         if reachability:
             roadmap = _with_reachability(roadmap, tolerances, progress, kept)
         if kept.folder is not None:

@@ -94,10 +94,12 @@ def _drawn_together(
         given_up, spread, travelled = (state[name].to(q.device) for name in ("given_up", "spread", "travelled"))
         fewest, before = (float(state[name]) for name in ("fewest", "before"))
         begin, waited, sacrifices = (int(state[name]) for name in ("done", "waited", "sacrifices"))
+        if bool(state["ended"]):
+            return best
     weight = _WEIGHT * float((1.0 / network.lengths).mean())
     for done in range(begin, _ROUNDS + 1):
         progress("certifying", done, _ROUNDS)
-        # the others cannot have come to where they are pulled, or no longer are
+        # the others will hardly have come to where they are pulled, or no longer are
         again = (2.0 * travelled >= _leeway(spread)).nonzero()[:, 0]
         spread[again], pairs, apart = _spread(network, corners[again], q, tolerances)
         travelled[again] = 0.0
@@ -113,8 +115,7 @@ def _drawn_together(
         numbers = {"fewest": fewest, "before": before, "waited": waited, "sacrifices": sacrifices}
         watched = {"given_up": given_up, "spread": spread, "travelled": travelled}
         if done == _ROUNDS or uncertified == 0 or waited == _PATIENCE or len(pulled) == 0:
-            # gone on from, it ends at once
-            kept.keep(_state(q, best, watched, {**numbers, "done": _ROUNDS}), last=True)
+            kept.keep(_state(q, best, watched, {**numbers, "done": done, "ended": True}), last=True)
             break
         # only what is beyond the aim is drawn in
         share = excess[pulled] / (excess[pulled] + _AIM)
@@ -123,13 +124,15 @@ def _drawn_together(
         steps = difference(q, moved, network.robot.continuous[:, None]).square().sum(0).sqrt()
         travelled += steps[corners].amax(1)
         q = moved
-        kept.keep(_state(q, best, watched, {**numbers, "done": done + 1}))
+        kept.keep(_state(q, best, watched, {**numbers, "done": done + 1, "ended": False}))
     return best
 
 
 def _leeway(spread: Tensor) -> Tensor:
     """How much the spread of cells (C,) would have to change to be drawn together, or not any more [rad]."""
-    return torch.maximum(_AIM - spread, spread - _HOPELESS).clamp_min(0.0)
+    leeway = torch.maximum(_AIM - spread, spread - _HOPELESS).clamp_min(0.0)
+    # of a cell that could not be followed to its centre nothing is known
+    return torch.where(spread.isinf(), 0.0, leeway)
 
 
 def _state(q: Tensor, best: Tensor, watched: dict[str, Tensor], numbers: dict[str, float]) -> dict[str, Tensor]:

@@ -7,6 +7,7 @@ the build is finished, its roadmap (`roadmap.grr`) takes their place.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -215,13 +216,11 @@ def _locked(folder: Path) -> int | None:
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
+    except OSError as error:
         os.close(handle)
+        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+            return None  # not every file system knows locks
         raise OutputError(folder, "another build is using it; valid: another folder, or to wait for its end") from error
-    except OSError:
-        # not every file system knows locks
-        os.close(handle)
-        return None
     return handle
 
 

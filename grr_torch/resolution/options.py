@@ -15,7 +15,6 @@ from grr_torch.resolution.objectives import check_objectives
 from grr_torch.resolution.problem import Problem
 from grr_torch.resolution.roadmap_file import robot_to_json
 from grr_torch.resolution.seeds import check_seeds
-from grr_torch.resolution.steep import check_max_slope
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import check_bounds, check_count
 from grr_torch.spaces.product import rotating
@@ -25,6 +24,8 @@ from grr_torch.tensor_file import tensor_hash
 from grr_torch.version import __version__
 
 METHODS = ("expansion", "random")
+# of what stages keep, and of how they come to it
+CHECKPOINT_VERSION = 2
 _MOST_STARTS = 100_000
 
 
@@ -40,6 +41,7 @@ def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> 
     Raises:
         ParameterError: A parameter is out of its range, or does not go with another.
         UnknownNameError: No such method or objective.
+        SeedError: Seeds are given, and none can be used.
     """
     check_seed(options["seed"])
     objectives, reachability, method = (options[name] for name in ("objectives", "reachability", "method"))
@@ -50,7 +52,6 @@ def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> 
         raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
     if method not in METHODS:
         raise UnknownNameError("method", method, METHODS)
-    check_max_slope(options["max_slope"])
     check_candidates(options["candidates"])
     if options["samples"] < 1:
         raise ParameterError("samples", options["samples"], "1 or more")
@@ -78,6 +79,11 @@ def describe_build(robot: Robot, problem: Problem, options: Mapping[str, Any]) -
     }
     seeds = problem.seeds if isinstance(problem.seeds, str) else tensor_hash(check_seeds(robot, problem.seeds).cpu())
     graph = {"points": tensor_hash(problem.graph.points), "edges": tensor_hash(problem.graph.edges)}
-    packages = {"grr-torch": __version__, "torch": torch.__version__, "device": robot.device.type}
+    packages = {
+        "grr-torch": __version__,
+        "checkpoint": CHECKPOINT_VERSION,
+        "torch": torch.__version__,
+        "device": robot.device.type,
+    }
     what = {"robot": robot.name, "arm": digest(arm), "task": problem.task.to_json(), **graph, "seeds": seeds}
     return {**packages, **what, **options}

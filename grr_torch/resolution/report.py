@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 # what `parameters["refinement"]` keeps of the quality before
 BEFORE = ("resolved_vertices", "connected_edges", "smoothness", "triangles_wound", "triangles_spread")
-# vertices that are listed
-_LISTED = 20
 # figures of a map without edges or vertices
 _MAY_BE_NONE = {"smoothness", "smoothest", "mean", "worst"}
 
@@ -76,16 +74,6 @@ def summary(roadmap: Roadmap, quality: Quality) -> str:
     if before["smoothness"] is not None and quality.smoothness is not None:
         changes.insert(0, f"smoothness {before['smoothness']:.3f} → {quality.smoothness:.3f}")
     return ", ".join(changes) + f", in {before['seconds']:.2f} s"
-
-
-def left_out(roadmap: Roadmap) -> str:
-    """What was left out of a roadmap as too steep, in one line; empty if no limit was set."""
-    told = roadmap.parameters.get("left_out")
-    if told is None:
-        return ""
-    vertices = ", ".join(map(str, told["vertices"][:_LISTED])) + (", …" if len(told["vertices"]) > _LISTED else "")
-    line = f"{told['edges']:,} edges steeper than {roadmap.parameters['max_slope']:g} rad/m"
-    return f"{line}; vertices {vertices}, which had no others" if vertices else line
 
 
 def traded(roadmap: Roadmap, quality: Quality) -> dict[str, str]:
