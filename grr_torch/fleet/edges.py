@@ -44,6 +44,7 @@ class SpreadCheck:
         self._ray = ray
         self._count = max(1, int(ray.available_resources().get("CPU", 1)))
         self._robot: Robot | None = None
+        self._sent: Any = None
         self._workers: list[Any] = []
 
     def __call__(
@@ -69,9 +70,10 @@ class SpreadCheck:
             return is_continuous(robot, task, *ends, tolerances=tolerances)
         if robot is not self._robot:
             worker = self._ray.remote(num_cpus=1, max_restarts=_RETRIES, max_task_retries=_RETRIES)(_Worker)
-            sent = self._ray.put(robot)
             self._robot, self._workers = robot, []  # those of another robot end, and free their cores
-            self._workers = [worker.remote(sent) for _ in range(self._count)]
+            # kept: a worker that takes the place of a lost one is made of it too
+            self._sent = self._ray.put(robot)
+            self._workers = [worker.remote(self._sent) for _ in range(self._count)]
         pieces = min(self._count, -(-count // _LEAST))
         parts = zip(*(end.tensor_split(pieces) for end in ends), strict=True)
         waiting = [
