@@ -18,7 +18,6 @@ from typer.testing import CliRunner
 
 import grr_torch
 from grr_torch.errors import FileFormatError, GrrWarning, OutputError, ParameterError
-from grr_torch.progress import silent
 from grr_torch.resolution import checkpoint as checkpoints
 from grr_torch.resolution.checkpoint import Checkpoint, Stage
 
@@ -257,19 +256,17 @@ def test_no_space_left_is_a_clear_error_and_what_is_there_is_gone_on_from(planar
 @pytest.mark.skipif(checkpoints.fcntl is None, reason="no POSIX locks here")
 def test_two_builds_do_not_share_a_folder(planar_5, tmp_path):
     refused = []
-
-    def build(progress=silent):
-        return grr_torch.build(planar_5, points=60, checkpoint=tmp_path, resume=True, progress=progress)
+    options = {"points": 60, "checkpoint": tmp_path, "resume": True}
 
     def second(stage, done, total):
         if not refused:
             with pytest.raises(OutputError, match="another build is using it"):
-                build()
+                grr_torch.build(planar_5, **options)
             refused.append(stage)
 
-    first = build(second)
+    first = grr_torch.build(planar_5, **options, progress=second)
     assert refused
-    assert torch.equal(build().connected, first.connected)
+    assert torch.equal(grr_torch.build(planar_5, **options).connected, first.connected)
 
 
 def test_resume_needs_a_checkpoint(planar_5):

@@ -163,15 +163,19 @@ class TaskSpace(ABC):
             jacobian: (6, n, N).
             targets: (width, N or 1) the points; only `axis`, whose rows depend on them, asks for them.
         """
-        rotation_rows = self.constraints - self.dimension
-        if self.dimension == 3 and rotation_rows in (0, 3):
-            return jacobian[: 3 + rotation_rows]
-        return torch.cat([jacobian[: self.dimension], jacobian[6 - rotation_rows :]])
+        if self._first_rows:
+            return jacobian[: self._first_rows]
+        return torch.cat([jacobian[: self.dimension], jacobian[6 - self.constraints + self.dimension :]])
+
+    @property
+    def _first_rows(self) -> int:
+        """How many of a Jacobian's first rows are all that answer to `error`; 0 if others do."""
+        return self.constraints if self.dimension == 3 and self.constraints in (3, 6) else 0
 
     def jacobian_of_few(self, jacobian: Array, targets: Array) -> Array:
         """`jacobian` for arrays; its rows may be those that are given."""
-        if self.dimension == 3 and self.constraints in (3, 6):
-            return jacobian[: self.constraints]
+        if self._first_rows:
+            return jacobian[: self._first_rows]
         return self.jacobian(torch.from_numpy(jacobian), torch.from_numpy(targets)).numpy()
 
     def residuals(self, error: Tensor) -> tuple[Tensor, Tensor]:
