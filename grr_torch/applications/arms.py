@@ -26,6 +26,8 @@ class Arms:
         held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
         held_q: (B, n) configurations there.
         closely: (B,) whether it is next looked for closely round the last one.
+        searched: (B,) whether it was looked for since the last look for a straight way, and
+        solvable: (B,) whether the target was then found to be solvable.
         last_vertex: (B,) the last vertex of a route, and
         last_goal: (B, width) the goal it belongs to; NaN where there is none.
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
@@ -44,6 +46,8 @@ class Arms:
     held: Array
     held_q: Array
     closely: Mask
+    searched: Mask
+    solvable: Mask
     last_vertex: Array
     last_goal: Array
     next_vertex: Array
@@ -71,6 +75,8 @@ class Arms:
             held=unknown(width),
             held_q=unknown(n),
             closely=np.zeros(count, dtype=bool),
+            searched=np.zeros(count, dtype=bool),
+            solvable=np.zeros(count, dtype=bool),
             last_vertex=np.full(count, -1),
             last_goal=unknown(width),
             next_vertex=np.full(count, -1),

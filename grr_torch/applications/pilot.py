@@ -45,17 +45,21 @@ class Pilot:
     def steps(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """The next step of some arms (A,) that are given targets (A, width).
 
-        On a route, steps that look for a straight way take turns with such that only follow it: none takes long.
+        On a route, steps that look for a straight way, and for a point to hold at, take turns with such that only
+        follow it: none takes long.
         """
-        blind = (arms.blind[which] > 0) & (arms.next_vertex[which] >= 0) & arms.on_task[which]
-        if not blind.any():
+        on_route = (arms.next_vertex[which] >= 0) & arms.on_task[which]
+        if not on_route.any():
             return self._look(arms, which, targets)
-        blind &= norms(targets - arms.aimed[which]) <= _SAME_GOAL
+        blind = on_route & (arms.blind[which] > 0) & (norms(targets - arms.aimed[which]) <= _SAME_GOAL)
+        arms.blind[which[blind]] -= 1
+        search = on_route & ~blind & arms.holds(which) & ~arms.searched[which]
         steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
-        on_way = blind.nonzero()[0]
-        if len(on_way):
-            arms.blind[which[on_way]] -= 1
-            steps.q[on_way], left[on_way] = self._route(arms, which[on_way])
+        if search.any():
+            self._hold(arms, which[search], targets[search])
+            steps.q[search], left[search] = self._route(arms, which[search], looked=True)
+        if blind.any():
+            steps.q[blind], left[blind] = self._route(arms, which[blind])
         rest = left.nonzero()[0]
         if len(rest):
             steps.put(rest, self._look(arms, which[rest], targets[rest]))
@@ -65,8 +69,11 @@ class Pilot:
         """`steps` of arms that look where they can go."""
         # who waits for a target to become feasible looks for a nearer point to hold at, and at the target with it
         lost = arms.holds(which)
-        if lost.any():
-            lost[lost.copy()] = ~self._hold(arms, which[lost], targets[lost])
+        search = lost & ~arms.searched[which]
+        if search.any():
+            self._hold(arms, which[search], targets[search])
+        lost &= ~arms.solvable[which]
+        arms.searched[which] = False
         steps, ends, valid, direct = self._straight(arms, which, targets, ~lost)
         arms.forget(which[direct])
         if direct.all():
@@ -114,8 +121,8 @@ class Pilot:
             steps.points[rows[free]], steps.codes[rows[free]] = lines.points[free], TRACKING
         return steps, ends, valid, direct
 
-    def _hold(self, arms: Arms, which: Array, targets: Array) -> Mask:
-        """Looks for the nearest points to targets (A, width) that arms can hold at; which targets are solvable (A,)."""
+    def _hold(self, arms: Arms, which: Array, targets: Array) -> None:
+        """Looks for the nearest points to targets (A, width) that arms can hold at, and whether these are solvable."""
         unset = ~arms.holds(which)
         base = np.where(unset[:, None], arms.p[which], arms.held[which])
         # what is not to be gone to by any route must not be where a jump leads
@@ -123,9 +130,8 @@ class Pilot:
         base_q = np.where(near[:, None], arms.q[which], arms.held_q[which])
         closely = arms.closely[which] & ~unset
         found = nearest_feasible(self.follower, self.solver, base, base_q, targets, closely)
-        arms.held[which], arms.held_q[which], solved = found
-        arms.closely[which] = ~closely
-        return solved
+        arms.held[which], arms.held_q[which], arms.solvable[which] = found
+        arms.closely[which], arms.searched[which] = ~closely, True
 
     def _indirect(self, arms: Arms, which: Array, targets: Array, valid: Mask, ends: Array) -> Steps:
         """`steps` of arms that cannot go straight to their targets.
