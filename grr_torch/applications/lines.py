@@ -63,7 +63,8 @@ class _Aim(NamedTuple):
         length: (B,) joint-space lengths [rad].
         short: (B,) lines all of which is looked at.
         fractions: (B, K + 1) where on a line these points are: on the way, after the step, and at the end.
-        looked: (B, K + 1) which of them there are: a short line has few on the way, a longer one none.
+        looked: (B, K + 1) which of them there are: a short line has few on the way, a longer one none. Where a line
+            ends within a step, its end is the step.
     """
 
     q: Array
@@ -146,7 +147,7 @@ class Follower:
         on_way = np.arange(1, most + 1)
         looked = np.empty((len(q), most + 1), dtype=bool)
         looked[:, :-2] = short[:, None] & (on_way[:-1] < pieces[:, None])
-        looked[:, -2:] = True
+        looked[:, -2], looked[:, -1] = share < _SLACK, True
         fractions = np.empty((len(q), most + 1), q.dtype)
         fractions[:, :-1] = on_way / pieces[:, None]
         fractions[:, -2] = np.minimum(share, 1.0)

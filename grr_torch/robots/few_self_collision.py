@@ -1,7 +1,7 @@
 """`SphereKernel` for a few configurations on the CPU, in numpy.
 
-All spheres are placed at once, whether they are near or not: up to some dozens of configurations the cost is that of
-calls. Distances are those of `SphereKernel`.
+All spheres are placed at once, whether they are near or not: up to some hundreds of configurations the cost is that
+of calls. Distances are those of `SphereKernel`.
 """
 
 from __future__ import annotations

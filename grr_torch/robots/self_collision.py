@@ -10,15 +10,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import are_few
 from grr_torch.robots.few_self_collision import FewSpheres
 from grr_torch.robots.kinematics import KinematicTree, place
 from grr_torch.robots.spheres import Sphere, SphereModel
 
 # sphere-pair distances held at once: they should stay in the cache
 _PAIRS_AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 26}
-# and those of a few configurations, all of which are held
-_PAIRS_OF_FEW = 1 << 20
+# of so many pairs at most, calls of numpy that place all spheres are faster, and may hold all distances
+_PAIRS_OF_FEW = 1 << 23
 
 
 class _Pair(NamedTuple):
@@ -120,7 +119,7 @@ class SphereKernel:
 
     def collides(self, frames: Tensor, margin: float) -> Tensor:
         """Whether any checked pair of links is nearer than `margin` [m]: (N,) bool; true where a frame is NaN."""
-        if are_few(frames) and self._padded * frames.shape[3] <= _PAIRS_OF_FEW:
+        if frames.device.type == "cpu" and self._padded * frames.shape[3] <= _PAIRS_OF_FEW:
             return torch.from_numpy(self._few.collides(frames.detach().numpy(), margin))
         near = ~(self._squared(frames, self.bounds) >= (self.bound_reach + margin).square())
         hit = torch.zeros(frames.shape[3], dtype=torch.bool, device=frames.device)
