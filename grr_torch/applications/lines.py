@@ -141,7 +141,7 @@ class Follower:
         """Which points on lines with motions (B, n) are looked at: no farther than half of ε apart."""
         share = _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
         length = norms(motion)
-        pieces = np.maximum(np.ceil(2.0 * length / self.epsilon), 2.0)
+        pieces = np.maximum(np.ceil(2.0 * length / self.epsilon), 1.0)
         short = pieces <= _MOST_PIECES
         most = int(pieces[short].max()) if short.any() else 2
         on_way = np.arange(1, most + 1)
