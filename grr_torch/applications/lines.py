@@ -26,6 +26,8 @@ _MOST_PIECES = 24
 _WIDEST = 2.0
 # lines no longer than this may have such gaps [rad]: it takes time to look into them
 _BRIDGED = 1.5
+# and is looked into by so many bisections: a gap that a 32nd of it still has is a jump
+_BISECTIONS = 5
 # of the longest step, so that what the projection adds seldom has to be cut off
 _SLACK = 0.98
 
@@ -185,7 +187,8 @@ class Follower:
             return torch.from_numpy(first), torch.from_numpy(second)
 
         c, epsilon = 0.5 * math.sqrt(self.robot.n), self.epsilon
-        joined = continuous_columns(self.robot, self.task, ends(points), ends(chain), c, epsilon, self.tolerances)
+        pairs = ends(points), ends(chain)
+        joined = continuous_columns(self.robot, self.task, *pairs, c, epsilon, self.tolerances, _BISECTIONS)
         result = np.ones(len(chain), dtype=bool)
         result[rows[~joined.numpy()]] = False
         return result

@@ -49,17 +49,18 @@ class Pilot:
         follow it: none takes long.
         """
         on_route = (arms.next_vertex[which] >= 0) & arms.on_task[which]
-        if not on_route.any():
-            return self._look(arms, which, targets)
         blind = on_route & (arms.blind[which] > 0) & (norms(targets - arms.aimed[which]) <= _SAME_GOAL)
         arms.blind[which[blind]] -= 1
-        search = on_route & ~blind & arms.holds(which) & ~arms.searched[which]
-        steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
+        # who waits for a target to become feasible looks for a nearer point to hold at, and at the target with it
+        search = arms.holds(which) & ~arms.searched[which] & ~blind
         if search.any():
             self._hold(arms, which[search], targets[search])
-            steps.q[search], left[search] = self._route(arms, which[search], looked=True)
-        if blind.any():
-            steps.q[blind], left[blind] = self._route(arms, which[blind])
+        if not on_route.any():
+            return self._look(arms, which, targets)
+        steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
+        on_way = (blind | search & on_route).nonzero()[0]
+        if len(on_way):
+            steps.q[on_way], left[on_way] = self._route(arms, which[on_way], search[on_way])
         rest = left.nonzero()[0]
         if len(rest):
             steps.put(rest, self._look(arms, which[rest], targets[rest]))
@@ -67,12 +68,7 @@ class Pilot:
 
     def _look(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """`steps` of arms that look where they can go."""
-        # who waits for a target to become feasible looks for a nearer point to hold at, and at the target with it
-        lost = arms.holds(which)
-        search = lost & ~arms.searched[which]
-        if search.any():
-            self._hold(arms, which[search], targets[search])
-        lost &= ~arms.solvable[which]
+        lost = arms.holds(which) & ~arms.solvable[which]
         arms.searched[which] = False
         steps, ends, valid, direct = self._straight(arms, which, targets, ~lost)
         arms.forget(which[direct])
@@ -155,7 +151,7 @@ class Pilot:
         if len(routed):
             chosen = which[routed]
             self._set_goals(arms, chosen, goals[routed], goals_q[routed])
-            steps.q[routed], left[routed] = self._route(arms, chosen, looked=True)
+            steps.q[routed], left[routed] = self._route(arms, chosen, np.ones(len(chosen), dtype=bool))
             arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[routed]
             found = ~left[routed]
             self._find_ended(arms, chosen[found], steps.q[routed[found]], targets[routed[found]])
@@ -196,10 +192,10 @@ class Pilot:
             arms.last_goal[which[moved]] = goals[moved]
             arms.last_vertex[which[moved]] = self._last_vertices(goals[moved], goals_q[moved])
 
-    def _route(self, arms: Arms, which: Array, looked: bool = False) -> tuple[Array, Mask]:
+    def _route(self, arms: Arms, which: Array, looked: Mask) -> tuple[Array, Mask]:
         """Steps (A, n) of arms on shortest paths to their last vertices, and which found no way (A,).
 
-        Arms that have `looked` round in this step go on to the next vertex; others try to leave some out.
+        Arms that have `looked` round (A,) in this step go on to the next vertex; others try to leave some out.
         """
         result, left = arms.q[which].copy(), np.ones(len(which), dtype=bool)
         ends = arms.last_vertex[which].tolist()
@@ -213,7 +209,7 @@ class Pilot:
                 current = int(arms.next_vertex[which[row]])
                 ahead = _ahead(current, following) if entries is None else entries[row].tolist()
                 on_edge = 0 if fresh else 1 + self._arrived(arms, int(which[row]))
-                if looked and not fresh:
+                if looked[row] and not fresh:
                     ahead = ahead[:on_edge]
                 tried += [(row, v, float(cost[v]), k < on_edge) for k, v in enumerate(ahead) if cost[v] < float("inf")]
             if tried:

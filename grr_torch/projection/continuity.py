@@ -79,14 +79,18 @@ def continuous_columns(
     c: float,
     epsilon: float,
     tolerances: Tolerances,
+    depth: int = _DEPTH,
 ) -> Tensor:
-    """`is_continuous` (N,) for columns: points (width, N) and configurations (n, N). One projection a bisection."""
+    """`is_continuous` (N,) for columns: points (width, N) and configurations (n, N). One projection a bisection.
+
+    What is still too far apart after `depth` bisections is not continuous.
+    """
     wraps = robot.continuous[:, None]
     (pa, pb), (qa, qb) = p, q
     continuous = torch.ones(qa.shape[1], dtype=torch.bool, device=qa.device)
     edge = torch.arange(qa.shape[1], device=qa.device)
     length = _length(qa, qb, wraps)
-    for _ in range(_DEPTH):
+    for _ in range(depth):
         pm = task.interpolate(pa.T, pb.T, 0.5).T
         qm, valid = project_columns(robot, task, pm, interpolate(qa, qb, 0.5, wraps), tolerances)
         first, second = _length(qa, qm, wraps), _length(qm, qb, wraps)
