@@ -28,6 +28,7 @@ class Arms:
         closely: (B,) whether it is next looked for closely round the last one.
         searched: (B,) whether it was looked for since the last look for a straight way, and
         solvable: (B,) whether the target was then found to be solvable.
+        turn: Whether it is all arms' turn to look for it.
         last_vertex: (B,) the last vertex of a route, and
         last_goal: (B, width) the goal it belongs to; NaN where there is none.
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
@@ -48,6 +49,7 @@ class Arms:
     closely: Mask
     searched: Mask
     solvable: Mask
+    turn: bool
     last_vertex: Array
     last_goal: Array
     next_vertex: Array
@@ -77,6 +79,7 @@ class Arms:
             closely=np.zeros(count, dtype=bool),
             searched=np.zeros(count, dtype=bool),
             solvable=np.zeros(count, dtype=bool),
+            turn=False,
             last_vertex=np.full(count, -1),
             last_goal=unknown(width),
             next_vertex=np.full(count, -1),

@@ -78,12 +78,17 @@ def nearest_feasible(
     # a point that the map no longer solves is better than none
     kept = np.expand_dims(known & ~np.isfinite(score[rows, best]), 1)
     found, found_q = np.where(kept, base, points[rows, best]), np.where(kept, base_q, q[rows, best])
-    distances, vertices = (part[:, 0].numpy() for part in solver.nearest(torch.from_numpy(targets)))
-    lost = ~np.isfinite(found_q).all(1)
-    over = np.expand_dims(lost | (distances < _NEARER * norms(found - targets)), 1)
+    nearer, vertices = much_nearer(solver, found, targets)
+    over = np.expand_dims(nearer | ~np.isfinite(found_q).all(1), 1)
     found = np.where(over, solver.points.numpy()[vertices], found)
     found_q = np.where(over, solver.configurations.numpy()[vertices], found_q)
     return found, found_q, solved[:, -1]
+
+
+def much_nearer(solver: Solver, points: Array, targets: Array) -> tuple[Mask, Array]:
+    """Where a resolved vertex is much nearer to the target than a point (B, width), (B,), and the nearest one (B,)."""
+    distances, vertices = (part[:, 0].numpy() for part in solver.nearest(torch.from_numpy(targets)))
+    return distances < _NEARER * norms(points - targets), vertices
 
 
 def _solve(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Mask, Array]:

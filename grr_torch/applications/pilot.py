@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from grr_torch.applications.arms import Arms
-from grr_torch.applications.hold import nearest_feasible
+from grr_torch.applications.hold import much_nearer, nearest_feasible
 from grr_torch.applications.lines import Follower, norms
 from grr_torch.applications.rejoin import rejoin
 from grr_torch.applications.routes import Routes
@@ -53,6 +53,10 @@ class Pilot:
         arms.blind[which[blind]] -= 1
         # who waits for a target to become feasible looks for a nearer point to hold at, and at the target with it
         search = arms.holds(which) & ~arms.searched[which] & ~blind
+        arms.turn = not arms.turn
+        if search.any() and not arms.turn:
+            # every other time, and all arms at once, is enough, unless one has come to the other side of a hole
+            search[search.copy()] = much_nearer(self.solver, arms.held[which[search]], targets[search])[0]
         if search.any():
             self._hold(arms, which[search], targets[search])
         if not on_route.any():
