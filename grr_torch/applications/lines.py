@@ -26,8 +26,8 @@ _MOST_PIECES = 24
 _WIDEST = 2.0
 # lines no longer than this may have such gaps [rad]: it takes time to look into them
 _BRIDGED = 1.5
-# and is looked into by so many bisections: a gap that a 32nd of it still has is a jump
-_BISECTIONS = 5
+# and is looked into by so many bisections: a gap that an eighth of it still has is a jump
+_BISECTIONS = 3
 # of the longest step, so that what the projection adds seldom has to be cut off
 _SLACK = 0.98
 
