@@ -9,28 +9,29 @@ import torch
 
 import grr_torch
 from grr_torch.errors import ParameterError
-from grr_torch.projection.continuity import is_continuous
-from grr_torch.projection.project import project
+from grr_torch.projection.continuity import continuous_columns, is_continuous
+from grr_torch.projection.project import DEFAULT_TOLERANCES, project
 from grr_torch.spaces.configuration import distance, interpolate
 from grr_torch.spaces.task import Position
 
 TASK = Position(2)
 
 
-def plain(robot, task, pa, pb, qa, qb, depth=0):
+def plain(robot, task, pa, pb, qa, qb, depth=0, deepest=20):
     """Algorithm 1 as the paper writes it, one edge, one call a bisection; a failed projection breaks the edge."""
     n = robot.n
     length = distance(qa, qb, robot.continuous)
     qm, valid = project(robot, task, task.interpolate(pa, pb, 0.5), interpolate(qa, qb, 0.5, robot.continuous))
     if length < 0.05 * math.sqrt(n):
         return bool(valid) if depth == 0 else True
-    if not valid or depth == 20:
+    if not valid or depth == deepest:
         return False
     pm = task.interpolate(pa, pb, 0.5)
     worst = max(distance(qa, qm, robot.continuous), distance(qm, qb, robot.continuous))
     if worst > 0.5 * math.sqrt(n) * length:
         return False
-    return plain(robot, task, pa, pm, qa, qm, depth + 1) and plain(robot, task, pm, pb, qm, qb, depth + 1)
+    halves = (pa, pm, qa, qm), (pm, pb, qm, qb)
+    return all(plain(robot, task, *half, depth + 1, deepest) for half in halves)
 
 
 def edges(robot, task, count, generator, step):
@@ -52,6 +53,18 @@ def test_agrees_with_the_plain_recursion(name, dimension, step, generator):
     expected = [plain(robot, task, *edge) for edge in zip(*sample, strict=True)]
     assert found.tolist() == expected
     assert len(set(expected)) == 2  # both answers occur
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+def test_what_is_not_joined_by_so_many_bisections_is_not_continuous(kinova, depth, generator):
+    task, n = Position(3), kinova.n
+    sample = edges(kinova, task, 60, generator, 0.3)
+    columns = [part.T.contiguous() for part in sample]
+    check = 0.5 * math.sqrt(n), 0.05 * math.sqrt(n), DEFAULT_TOLERANCES
+    found = continuous_columns(kinova, task, columns[:2], columns[2:], *check, depth)
+    expected = [plain(kinova, task, *edge, deepest=depth) for edge in zip(*sample, strict=True)]
+    assert found.tolist() == expected
+    assert sum(expected) < int(is_continuous(kinova, task, *sample).sum())
 
 
 def test_an_edge_from_a_configuration_to_itself_is_continuous(planar_5, generator):

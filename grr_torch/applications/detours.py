@@ -1,0 +1,162 @@
+"""Detours over the roadmap: shortest paths of arms to where they cannot go straight."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from grr_torch.applications.arms import Arms
+from grr_torch.applications.lines import Follower, norms
+from grr_torch.applications.routes import Routes
+from grr_torch.applications.solve import Solver
+from grr_torch.pieces import Array, Mask
+
+# vertices that are tried as the first of a route, and as its last
+_ENTRIES = 6
+_ENDS = 8
+# of the latter, those that are tried first
+_LIKELY = 2
+# metres that a goal moves before the last vertex of the route to it is looked for again
+SAME_GOAL = 0.03
+# the most steps for which an arm on a route does not look for a straight way
+_MOST_DOUBT = 32
+# edges that an arm avoids before it gives a goal up
+_MOST_AVOIDED = 8
+# an arm so near [rad or m] to a vertex's configuration is at the vertex
+_ARRIVED = 1e-6
+
+
+class Detours:
+    """Leads arms over the roadmap. Works on arrays, as `Follower` does."""
+
+    def __init__(self, follower: Follower, solver: Solver, routes: Routes) -> None:
+        self.follower, self.solver, self.routes = follower, solver, routes
+
+    def set_goals(self, arms: Arms, which: Array, goals: Array, goals_q: Array) -> None:
+        """Looks for the last vertices of arms' routes again, where the goals (A, width) have moved."""
+        moved = ~(norms(goals - arms.last_goal[which]) <= SAME_GOAL)
+        # whose straight way to the same goal came to nothing trusts the next one later, lest it goes to and fro
+        again = arms.next_vertex[which] < 0
+        longer = np.minimum(np.where(again, 2 * arms.doubt[which], arms.doubt[which]), _MOST_DOUBT)
+        arms.doubt[which] = np.where(moved, 1, longer)
+        if moved.any():
+            for arm in which[moved].tolist():
+                arms.avoided[arm] = frozenset()
+            arms.last_goal[which[moved]] = goals[moved]
+            arms.last_vertex[which[moved]] = self._last_vertices(goals[moved], goals_q[moved])
+
+    def follow(self, arms: Arms, which: Array, looked: Mask) -> tuple[Array, Mask]:
+        """Steps (A, n) of arms on shortest paths to their last vertices, and which found no way (A,).
+
+        Arms that have `looked` round (A,) in this step go on to the next vertex; others try to leave some out.
+        """
+        result, left = arms.q[which].copy(), np.ones(len(which), dtype=bool)
+        ends = arms.last_vertex[which].tolist()
+        for fresh in (False, True):
+            # where the next vertex of a route cannot be gone to any more, a new way in is looked for
+            rows = (left & ((arms.next_vertex[which] >= 0) | fresh)).nonzero()[0].tolist()
+            entries = self.nearest(arms.p[which], _ENTRIES) if fresh and rows else None
+            tried: list[tuple[int, int, float, bool]] = []
+            for row in rows:
+                cost, following = self.routes.towards(ends[row], arms.avoided[int(which[row])])
+                current = int(arms.next_vertex[which[row]])
+                ahead = _ahead(current, following) if entries is None else entries[row].tolist()
+                on_edge = 0 if fresh else 1 + self._arrived(arms, int(which[row]))
+                if looked[row] and not fresh:
+                    ahead = ahead[:on_edge]
+                tried += [(row, v, float(cost[v]), k < on_edge) for k, v in enumerate(ahead) if cost[v] < float("inf")]
+            if tried:
+                self._enter(arms, which, result, left, tried)
+        return result, left
+
+    def find_ended(self, arms: Arms, which: Array, steps: Array, targets: Array) -> None:
+        """Looks for arms (A,) whose next configurations (A, n) are where they stand: their route has come to nothing.
+
+        From a vertex whose next edge cannot be followed, another route is taken. Where there is no way on from the last
+        vertex, the arm is to go as near to its target (A, width) as it can.
+        """
+        for row in (np.abs(steps - arms.q[which]).max(1) <= _ARRIVED).nonzero()[0].tolist():
+            arm = int(which[row])
+            here, last = int(arms.next_vertex[arm]), int(arms.last_vertex[arm])
+            following = -1 if here < 0 else int(self.routes.towards(last, arms.avoided[arm])[1][here])
+            if here != last and following >= 0 and len(arms.avoided[arm]) < _MOST_AVOIDED:
+                arms.avoided[arm] |= {(here, following)}
+            else:
+                arms.barred[arm] = targets[row]
+            arms.blind[arm] = 0
+
+    def _arrived(self, arms: Arms, arm: int) -> bool:
+        """Whether an arm is at the vertex that its route led to."""
+        return bool(self.follower.distance(arms.q[arm], self.placed[arms.next_vertex[arm]]) < _ARRIVED)
+
+    def _enter(
+        self, arms: Arms, which: Array, result: Array, left: Mask, tried: list[tuple[int, int, float, bool]]
+    ) -> None:
+        """Sends arms (A,) to that of their vertices from which the way is shortest, if one can be gone to.
+
+        Args:
+            arms: All arms.
+            which: (A,) those that are routed.
+            result: (A, n) their next configurations, which are set.
+            left: (A,) those that have no next configuration yet.
+            tried: Row in `which`, vertex, length of the way from there, and whether the arm is on an edge that leads
+                there, which is known to be continuous.
+        """
+        owner, vertex, lengths, on_edge = (np.array(part) for part in zip(*tried, strict=True))
+        q, p = arms.q[which[owner]], arms.p[which[owner]]
+        placed, points = self.placed[vertex], self._points[vertex]
+        lines = self.follower.follow(q, p, placed, points)
+        total = np.where(lines.direct | (lines.safe & on_edge), lengths + self.follower.distance(q, placed), np.inf)
+        for row in dict.fromkeys(owner.tolist()):
+            mine = (owner == row).nonzero()[0]
+            # of equal ways, the one that leads on
+            best = mine[len(mine) - 1 - total[mine][::-1].argmin()]
+            if total[best] < np.inf:
+                result[row], left[row] = lines.steps[best], False
+                arms.next_vertex[which[row]] = vertex[best]
+
+    def _last_vertices(self, goals: Array, goals_q: Array) -> Array:
+        """Of the vertices round each goal that it is joined to by a continuous line, the one most like it.
+
+        Of all of them, where there is no such line.
+        """
+        vertices = self.nearest(goals, _ENDS)
+        apart = self.follower.distance(self.placed[vertices], goals_q[:, None])
+        vertices = np.take_along_axis(vertices, apart.argsort(1, kind="stable"), axis=1)
+        chosen, left = vertices[:, 0].copy(), np.arange(len(goals))
+        # the first one that is joined is it, and it is seldom far down the list
+        for tried in (vertices[:, :_LIKELY], vertices[:, _LIKELY:]):
+            ends = tried[left]
+            if ends.size == 0:
+                break
+            q, p = (part[left].repeat(ends.shape[1], 0) for part in (goals_q, goals))
+            lines = self.follower.follow(q, p, self.placed[ends.ravel()], self._points[ends.ravel()])
+            joined = lines.direct.reshape(ends.shape)
+            found = joined.any(1)
+            chosen[left[found]] = ends[found, joined[found].argmax(1)]
+            left = left[~found]
+        return chosen
+
+    def nearest(self, points: Array, count: int) -> Array:
+        """(A, count) resolved vertices nearest to points (A, width)."""
+        return self.solver.nearest(torch.from_numpy(points), count)[1].numpy()
+
+    @cached_property
+    def placed(self) -> Array:
+        """(V, n) configurations of the vertices."""
+        return self.solver.configurations.numpy()
+
+    @cached_property
+    def _points(self) -> Array:
+        """(V, width) points of the vertices."""
+        return self.solver.points.numpy()
+
+
+def _ahead(vertex: int, following: np.ndarray) -> list[int]:
+    """A vertex and the next two on the way from it."""
+    path = [vertex]
+    while len(path) < 3 and following[path[-1]] >= 0:
+        path.append(int(following[path[-1]]))
+    return path
