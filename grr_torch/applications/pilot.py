@@ -41,7 +41,6 @@ class Pilot:
         arms.blind[which[blind]] -= 1
         # who waits for a target to become feasible looks for a nearer point to hold at, and at the target with it
         search = arms.holds(which) & ~arms.searched[which] & ~blind
-        arms.turn = not arms.turn
         if search.any() and not arms.turn:
             # every other time, and all arms at once, is enough, unless one has come to the other side of a hole
             search[search.copy()] = much_nearer(self.solver, arms.held[which[search]], targets[search])[0]

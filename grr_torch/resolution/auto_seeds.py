@@ -42,8 +42,8 @@ _NEIGHBOURS = 24
 _RELAXED = 0.16
 _FINALISTS = 0.03
 # in so many rounds each
-_ROUNDS = 8
-_FINAL_ROUNDS = 5
+_ROUNDS = 5
+_FINAL_ROUNDS = 3
 # edges steeper than this many times the median are not relaxed
 _STEEP = 6.0
 # an edge that is missing, broken, or steeper, counts as this many times the smallest median of slopes
