@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from grr_torch.cli.show import markdown_table, print_json, print_rows, reports_errors
+from grr_torch.cli.show import markdown_table, print_json, print_rows, progress_bar, reports_errors
 from grr_torch.cli.show_learning import ERROR_HEAD, WARM_HEAD, error_rows, figure_rows, warm_rows
 
 
@@ -30,8 +30,12 @@ def eval_ik(
 
     roadmap = Roadmap.load(file)
     ik = NeuralIK.load(weights, roadmap)
-    evaluation = evaluate_ik(ik, roadmap, points=points, seed=seed)
-    warm = compare_warm_starts(ik, roadmap, points=points, seed=seed)
+    with progress_bar() as progress:
+        progress("measuring the network", 0, 2)
+        evaluation = evaluate_ik(ik, roadmap, points=points, seed=seed)
+        progress("comparing warm starts", 1, 2)
+        warm = compare_warm_starts(ik, roadmap, points=points, seed=seed)
+        progress("comparing warm starts", 2, 2)
     if as_json:
         rows = [row.to_dict() for row in warm]
         print_json({"machine": machine(), **evaluation.to_dict(), "warm_start": rows})
