@@ -55,7 +55,7 @@ def test_agrees_with_the_plain_recursion(name, dimension, step, generator):
     assert len(set(expected)) == 2  # both answers occur
 
 
-@pytest.mark.parametrize("depth", [1, 3])
+@pytest.mark.parametrize("depth", [3, 5])
 def test_what_is_not_joined_by_so_many_bisections_is_not_continuous(kinova, depth, generator):
     task, n = Position(3), kinova.n
     sample = edges(kinova, task, 60, generator, 0.3)
@@ -64,7 +64,7 @@ def test_what_is_not_joined_by_so_many_bisections_is_not_continuous(kinova, dept
     found = continuous_columns(kinova, task, columns[:2], columns[2:], *check, depth)
     expected = [plain(kinova, task, *edge, deepest=depth) for edge in zip(*sample, strict=True)]
     assert found.tolist() == expected
-    assert sum(expected) < int(is_continuous(kinova, task, *sample).sum())
+    assert 0 < sum(expected) < int(is_continuous(kinova, task, *sample).sum())
 
 
 def test_an_edge_from_a_configuration_to_itself_is_continuous(planar_5, generator):

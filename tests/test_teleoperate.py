@@ -93,6 +93,56 @@ def test_targets_out_of_reach_are_approached_and_slid_along(roadmap):
     assert longest < 25
 
 
+def _unreachable(roadmap, count, seed):
+    """Points (count, 3) a little beyond the edge of reach, and configurations of arms that hold there."""
+    vertices = _vertices(roadmap, count, seed)
+    points, q = roadmap.points[vertices], roadmap.configurations[vertices]
+    return 1.5 * points / points.norm(dim=1, keepdim=True), q
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+def test_input_that_is_refused_every_other_time_hides_no_target(roadmap, phase):
+    """As from trackers at half the rate, in turn: arms hold out of reach, then their targets come back a little."""
+    out, start = _unreachable(roadmap, 12, 11)
+    teleoperator = Teleoperator(roadmap, start=start, max_step=0.1)
+    arms = torch.arange(12)
+
+    def follow(goals, steps):
+        for step in range(steps):
+            given = (arms + step) % 2 == phase
+            command = teleoperator.step(torch.where(given[:, None], goals, torch.nan))
+        return command
+
+    follow(out, 120)
+    held = torch.from_numpy(teleoperator._arms.held)
+    assert bool(held.isfinite().all())
+    # nearer to the held point than to any vertex
+    goals = 0.97 * held
+    solvable = roadmap.solve(goals).valid
+    assert int(solvable.sum()) >= 6
+    command = follow(goals, 40)
+    apart = (roadmap.robot.forward_kinematics(command.configuration)[0] - goals).norm(dim=1)
+    assert float(apart[solvable].max()) < 1e-3
+
+
+def test_a_target_that_becomes_solvable_is_noticed_on_a_detour_too(roadmap):
+    """Arms on the way to where they will hold, across the base, when each target comes back a little."""
+    vertices = _vertices(roadmap, 40, 13)
+    start, points = roadmap.configurations[vertices], roadmap.points[vertices]
+    out = points * torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
+    out = 1.3 * out / out.norm(dim=1, keepdim=True)
+    teleoperator = Teleoperator(roadmap, start=start)
+    for _ in range(13):
+        command = teleoperator.step(out)
+    arms = teleoperator._arms
+    goals = 0.97 * torch.from_numpy(arms.held)
+    changed = torch.from_numpy(command.status == "detouring") & roadmap.solve(goals).valid
+    assert int(changed.sum()) >= 8
+    for _ in range(6):
+        teleoperator.step(goals)
+    assert not arms.holds(changed.nonzero()[:, 0].numpy()).any()
+
+
 def test_an_arm_on_its_task_keeps_it_while_it_tracks(roadmap):
     vertices = _vertices(roadmap, 10, 7)
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertices[:5]])

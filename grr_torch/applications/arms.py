@@ -26,9 +26,11 @@ class Arms:
         held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
         held_q: (B, n) configurations there.
         closely: (B,) whether it is next looked for closely round the last one.
-        searched: (B,) whether it was looked for since the last look for a straight way, and
-        solvable: (B,) whether the target was then found to be solvable.
-        turn: Whether it is all arms' turn to look for it.
+        sought: (B, width) the target for which it was last looked for; NaN where there is none.
+        searched: (B,) whether what was found then has not been acted on yet.
+        solvable: (B,) whether that target was solvable.
+        waited: (B,) arms that did not look for it in the last step, though it was due.
+        turn: Whether it is the turn of all arms to look for it.
         last_vertex: (B,) the last vertex of a route, and
         last_goal: (B, width) the goal it belongs to; NaN where there is none.
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
@@ -47,8 +49,10 @@ class Arms:
     held: Array
     held_q: Array
     closely: Mask
+    sought: Array
     searched: Mask
     solvable: Mask
+    waited: Mask
     turn: bool
     last_vertex: Array
     last_goal: Array
@@ -77,8 +81,10 @@ class Arms:
             held=unknown(width),
             held_q=unknown(n),
             closely=np.zeros(count, dtype=bool),
+            sought=unknown(width),
             searched=np.zeros(count, dtype=bool),
             solvable=np.zeros(count, dtype=bool),
+            waited=np.zeros(count, dtype=bool),
             turn=False,
             last_vertex=np.full(count, -1),
             last_goal=unknown(width),

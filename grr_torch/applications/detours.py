@@ -47,10 +47,11 @@ class Detours:
             arms.last_goal[which[moved]] = goals[moved]
             arms.last_vertex[which[moved]] = self._last_vertices(goals[moved], goals_q[moved])
 
-    def follow(self, arms: Arms, which: Array, looked: Mask) -> tuple[Array, Mask]:
+    def follow(self, arms: Arms, which: Array, briefly: Mask) -> tuple[Array, Mask]:
         """Steps (A, n) of arms on shortest paths to their last vertices, and which found no way (A,).
 
-        Arms that have `looked` round (A,) in this step go on to the next vertex; others try to leave some out.
+        Arms that have to do it `briefly` (A,), for something else took time, go on to the next vertex; others try to
+        leave some out.
         """
         result, left = arms.q[which].copy(), np.ones(len(which), dtype=bool)
         ends = arms.last_vertex[which].tolist()
@@ -64,15 +65,15 @@ class Detours:
                 current = int(arms.next_vertex[which[row]])
                 ahead = _ahead(current, following) if entries is None else entries[row].tolist()
                 on_edge = 0 if fresh else 1 + self._arrived(arms, int(which[row]))
-                if looked[row] and not fresh:
+                if briefly[row] and not fresh:
                     ahead = ahead[:on_edge]
                 tried += [(row, v, float(cost[v]), k < on_edge) for k, v in enumerate(ahead) if cost[v] < float("inf")]
             if tried:
                 self._enter(arms, which, result, left, tried)
         return result, left
 
-    def find_ended(self, arms: Arms, which: Array, steps: Array, targets: Array) -> None:
-        """Looks for arms (A,) whose next configurations (A, n) are where they stand: their route has come to nothing.
+    def give_up_ended(self, arms: Arms, which: Array, steps: Array, targets: Array) -> None:
+        """Gives up routes that have come to nothing: the next configurations (A, n) of their arms are where they stand.
 
         From a vertex whose next edge cannot be followed, another route is taken. Where there is no way on from the last
         vertex, the arm is to go as near to its target (A, width) as it can.

@@ -26,7 +26,7 @@ _MOST_PIECES = 24
 _WIDEST = 2.0
 # lines no longer than this may have such gaps [rad]: it takes time to look into them
 _BRIDGED = 1.5
-# and is looked into by so many bisections: a gap that an eighth of it still has is a jump
+# and it is looked into by so many bisections: what spans ε or more even in an eighth of the gap is a jump
 _BISECTIONS = 3
 # of the longest step, so that what the projection adds seldom has to be cut off
 _SLACK = 0.98

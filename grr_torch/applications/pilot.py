@@ -33,29 +33,42 @@ class Pilot:
     def steps(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """The next step of some arms (A,) that are given targets (A, width).
 
-        On a route, steps that look for a straight way, and for a point to hold at, take turns with such that only
-        follow it: none takes long.
+        Steps that take long take turns with others. On a route, one that looks for a straight way comes after one that
+        only follows the route; and points to hold at are searched for in every other step, of all arms at once.
         """
         on_route = (arms.next_vertex[which] >= 0) & arms.on_task[which]
         blind = on_route & (arms.blind[which] > 0) & (norms(targets - arms.aimed[which]) <= SAME_GOAL)
         arms.blind[which[blind]] -= 1
-        # who waits for a target to become feasible looks for a nearer point to hold at, and at the target with it
-        search = arms.holds(which) & ~arms.searched[which] & ~blind
-        if search.any() and not arms.turn:
-            # every other time, and all arms at once, is enough, unless one has come to the other side of a hole
-            search[search.copy()] = much_nearer(self.solver, arms.held[which[search]], targets[search])[0]
-        if search.any():
-            self._hold(arms, which[search], targets[search])
+        wanted = self._search(arms, which, targets, arms.holds(which) & ~blind)
         if not on_route.any():
             return self._look(arms, which, targets)
         steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
-        on_way = (blind | search & on_route).nonzero()[0]
+        on_way = (blind | wanted & on_route).nonzero()[0]
         if len(on_way):
-            steps.q[on_way], left[on_way] = self.detours.follow(arms, which[on_way], search[on_way])
+            steps.q[on_way], left[on_way] = self.detours.follow(arms, which[on_way], wanted[on_way])
         rest = left.nonzero()[0]
         if len(rest):
             steps.put(rest, self._look(arms, which[rest], targets[rest]))
         return steps
+
+    def _search(self, arms: Arms, which: Array, targets: Array, holding: Mask) -> Mask:
+        """Looks for nearer points to hold at, and at the targets with them, of arms that are holding (A,).
+
+        Returns:
+            (A,) the arms for which that was due in this step, whether it was their turn or they have to wait for it. An
+            arm waits once, and not if its target has leapt, or a vertex on the other side of a hole has come nearer.
+        """
+        leapt = ~(norms(targets - arms.sought[which]) <= SAME_GOAL)
+        wanted = holding & (leapt | ~arms.searched[which])
+        arms.turn = not arms.turn
+        search = wanted & (leapt | arms.waited[which] | arms.turn)
+        waits = (wanted & ~search).nonzero()[0]
+        if len(waits):
+            search[waits] = much_nearer(self.solver, arms.held[which[waits]], targets[waits])[0]
+        arms.waited[which] = wanted & ~search
+        if search.any():
+            self._hold(arms, which[search], targets[search])
+        return wanted
 
     def _look(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """`steps` of arms that look where they can go."""
@@ -118,7 +131,7 @@ class Pilot:
         closely = arms.closely[which] & ~unset
         found = nearest_feasible(self.follower, self.solver, base, base_q, targets, closely)
         arms.held[which], arms.held_q[which], arms.solvable[which] = found
-        arms.closely[which], arms.searched[which] = ~closely, True
+        arms.closely[which], arms.searched[which], arms.sought[which] = ~closely, True, targets
 
     def _indirect(self, arms: Arms, which: Array, targets: Array, valid: Mask, ends: Array) -> Steps:
         """`steps` of arms that cannot go straight to their targets.
@@ -145,7 +158,7 @@ class Pilot:
             steps.q[routed], left[routed] = self.detours.follow(arms, chosen, np.ones(len(chosen), dtype=bool))
             arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[routed]
             found = ~left[routed]
-            self.detours.find_ended(arms, chosen[found], steps.q[routed[found]], targets[routed[found]])
+            self.detours.give_up_ended(arms, chosen[found], steps.q[routed[found]], targets[routed[found]])
         for row in left.nonzero()[0].tolist():
             step = self._back(arms, int(which[row]), goals_q[row])
             if step is None:
@@ -157,7 +170,8 @@ class Pilot:
     def _back(self, arms: Arms, arm: int, goal_q: Array) -> Array | None:
         """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near."""
         arms.next_vertex[arm] = -1
-        ends = self.detours.placed[self.detours.nearest(arms.p[arm][None], _WAYS_BACK)[0]]
+        near = self.solver.nearest(torch.from_numpy(arms.p[arm][None]), _WAYS_BACK)[1][0]
+        ends = self.solver.configurations[near].numpy()
         here = self.solver.solve_columns(torch.from_numpy(arms.p[arm][:, None]))[0].T.numpy()
         if not self.follower.distance(here, arms.q[arm])[0] <= _ON_MAP:
             ends = np.concatenate([goal_q[None], here, ends])

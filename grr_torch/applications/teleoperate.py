@@ -187,7 +187,6 @@ class Teleoperator:
         assert arms is not None
         q, goals, points = arms.q.copy(), arms.q.copy(), arms.p.copy()
         codes = np.full(len(targets), HOLDING)
-        arms.turn = not arms.turn
         which = accepted.nonzero()[0]
         if len(which):
             q[which], goals[which], points[which], codes[which] = self._pilot.steps(arms, which, targets[which])

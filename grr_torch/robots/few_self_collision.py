@@ -1,6 +1,6 @@
 """`SphereKernel` for a few configurations on the CPU, in numpy.
 
-All spheres are placed at once, whether they are near or not: up to some hundreds of configurations the cost is that
+All spheres are placed at once, whether they are near or not: up to about a thousand configurations the cost is that
 of calls. Distances are those of `SphereKernel`.
 """
 
@@ -15,6 +15,10 @@ from grr_torch.pieces import Array
 
 if TYPE_CHECKING:
     from grr_torch.robots.self_collision import SphereKernel
+
+
+# distances between spheres that are held at once: they should stay in the cache
+_DISTANCES_AT_ONCE = 1 << 16
 
 
 class FewSpheres:
@@ -47,14 +51,16 @@ class FewSpheres:
         apart = placed[self._first, 0] - placed[self._second, 0]
         near = ~((apart * apart).sum(1) >= np.square(self._bound_reach + margin))
         pairs, columns = near.nonzero()
-        hit = np.zeros(width, dtype=bool)
-        if len(pairs):
+        hit, limits = np.zeros(width, dtype=bool), np.square(self._reach + margin)
+        at_once = max(1, _DISTANCES_AT_ONCE // self._reach[0].size)
+        for start in range(0, len(pairs), at_once):
+            which, column = pairs[start : start + at_once], columns[start : start + at_once]
             # relative to the first link, so that little is lost in the difference of squares
-            near_to = placed[self._first[pairs], 0, :, columns][:, None]
-            a, b = (placed[side[pairs], 1:, :, columns] - near_to for side in (self._first, self._second))
+            near_to = placed[self._first[which], 0, :, column][:, None]
+            a, b = (placed[side[which], 1:, :, column] - near_to for side in (self._first, self._second))
             squared = (a * a).sum(2)[:, :, None] + (b * b).sum(2)[:, None] - 2.0 * np.matmul(a, b.transpose(0, 2, 1))
-            touching = ~(squared >= np.square(self._reach + margin)[pairs]).reshape(len(pairs), -1).all(1)
-            hit[columns[touching]] = True
+            touching = ~(squared >= limits[which]).reshape(len(which), -1).all(1)
+            hit[column[touching]] = True
         return hit
 
 

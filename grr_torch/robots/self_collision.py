@@ -16,8 +16,10 @@ from grr_torch.robots.spheres import Sphere, SphereModel
 
 # sphere-pair distances held at once: they should stay in the cache
 _PAIRS_AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 26}
-# of so many pairs at most, calls of numpy that place all spheres are faster, and may hold all distances
-_PAIRS_OF_FEW = 1 << 23
+# of no more pairs, links filled up to equally many spheres, numpy that places all spheres is faster (but near contact,
+# where it takes up to twice as long), unless filling up makes them so many times as many
+_PAIRS_OF_FEW = 6 << 20
+_FILLED = 4
 
 
 class _Pair(NamedTuple):
@@ -119,7 +121,7 @@ class SphereKernel:
 
     def collides(self, frames: Tensor, margin: float) -> Tensor:
         """Whether any checked pair of links is nearer than `margin` [m]: (N,) bool; true where a frame is NaN."""
-        if frames.device.type == "cpu" and self._padded * frames.shape[3] <= _PAIRS_OF_FEW:
+        if frames.device.type == "cpu" and frames.shape[3] <= self._most_of_few:
             return torch.from_numpy(self._few.collides(frames.detach().numpy(), margin))
         near = ~(self._squared(frames, self.bounds) >= (self.bound_reach + margin).square())
         hit = torch.zeros(frames.shape[3], dtype=torch.bool, device=frames.device)
@@ -132,9 +134,11 @@ class SphereKernel:
         return hit
 
     @cached_property
-    def _padded(self) -> int:
-        """Pairs of spheres of a configuration, if all links had as many as the largest."""
-        return len(self.spheres) * max(max(pair.reach.shape[:2]) for pair in self.spheres) ** 2
+    def _most_of_few(self) -> int:
+        """Configurations up to which all spheres are placed by numpy."""
+        pairs = sum(pair.reach.numel() for pair in self.spheres)
+        filled = len(self.spheres) * max(max(pair.reach.shape[:2]) for pair in self.spheres) ** 2
+        return _PAIRS_OF_FEW // filled if filled <= _FILLED * pairs else 0
 
     @cached_property
     def _few(self) -> FewSpheres:
