@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import hypothesis
 import pytest
 import torch
+from grr_torch.cli.main import run as run_command
 from random_robots import BOX_ARM
 
 import grr_torch
+from grr_torch import NeuralIK, TrainingOptions, train_ik
+from grr_torch.learning.network import Architecture
 
 # how long an example takes is the machine's affair
 hypothesis.settings.register_profile("any machine", deadline=None)
@@ -29,6 +33,30 @@ def planar_5() -> grr_torch.Robot:
 @pytest.fixture(scope="session")
 def planar_roadmap(planar_5) -> grr_torch.Roadmap:
     return grr_torch.build(planar_5, "position", points=300, reachability=8)
+
+
+@pytest.fixture(scope="session")
+def tiny_ik(planar_roadmap) -> NeuralIK:
+    """A network that has hardly learned the planar roadmap."""
+    architecture = Architecture(width=32, depth=2, waves=4)
+    return train_ik(planar_roadmap, TrainingOptions(samples=3000, epochs=3, batch=256, architecture=architecture))
+
+
+@pytest.fixture
+def run_cli(tmp_path, monkeypatch, capfd):
+    """Runs a command in a folder of its own; gives its exit code and what it printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        code = 0
+        with warnings.catch_warnings():
+            try:
+                run_command([str(word) for word in words])
+            except SystemExit as end:
+                code = end.code or 0
+        return code, *capfd.readouterr()
+
+    return run
 
 
 @pytest.fixture

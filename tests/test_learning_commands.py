@@ -3,52 +3,31 @@
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import replace
 
 import pytest
-from grr_torch.cli.main import run as run_command
 
-from grr_torch import NeuralIK, TrainingOptions, train_ik
+from grr_torch import NeuralIK
 from grr_torch.errors import ParameterError
 from grr_torch.experiments.learning import compare_warm_starts
 from grr_torch.learning.checkpoint import checkpoint_path
-from grr_torch.learning.network import Architecture
 from grr_torch.learning.split import SPLITS
 
-TINY = TrainingOptions(samples=3000, epochs=3, batch=256, architecture=Architecture(width=32, depth=2, waves=4))
-
 
 @pytest.fixture(scope="module")
-def trained(planar_roadmap) -> NeuralIK:
-    return train_ik(planar_roadmap, TINY)
-
-
-@pytest.fixture(scope="module")
-def folder(planar_roadmap, trained, tmp_path_factory):
+def folder(planar_roadmap, tiny_ik, tmp_path_factory):
     path = tmp_path_factory.mktemp("learning")
     planar_roadmap.save(path / "r.grr")
-    trained.save(path / "ik.safetensors")
+    tiny_ik.save(path / "ik.safetensors")
     return path
 
 
 @pytest.fixture
-def command(folder, tmp_path, monkeypatch, capfd):
-    """Runs a command in a folder of its own; gives its exit code and what it printed."""
-    monkeypatch.chdir(tmp_path)
+def command(folder, tmp_path, run_cli):
+    """Runs a command beside a roadmap and the weights that learned it."""
     for name in ("r.grr", "ik.safetensors"):
         (tmp_path / name).symlink_to(folder / name)
-
-    def run(*words):
-        code = 0
-        with warnings.catch_warnings():
-            try:
-                run_command([str(word) for word in words])
-            except SystemExit as end:
-                code = end.code or 0
-        return code, *capfd.readouterr()
-
-    return run
+    return run_cli
 
 
 def test_export_writes_a_file_and_says_what_is_in_it(command, tmp_path):

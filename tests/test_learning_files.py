@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import torch
 from safetensors.numpy import load_file
 
 import grr_torch
-from grr_torch import NeuralIK, Split, TrainingOptions, train_ik
+from grr_torch import Split, TrainingOptions
 from grr_torch.errors import GrrError, MissingPackageError
 from grr_torch.experiments.learning import compare_warm_starts, independent_solutions, measure_learning
 from grr_torch.learning.export import export_dataset
@@ -22,21 +21,7 @@ from grr_torch.learning.split import SPLITS
 from grr_torch.resolution.roadmap_file import read_file, roadmap_hash
 from grr_torch.tensor_file import tensors_hash
 
-TINY = TrainingOptions(samples=3000, epochs=3, batch=256, architecture=Architecture(width=32, depth=2, waves=4))
 ROWS = 20_000
-
-
-@pytest.fixture(scope="module")
-def trained(planar_roadmap) -> NeuralIK:
-    return train_ik(planar_roadmap, TINY)
-
-
-@pytest.fixture(scope="module")
-def folder(planar_roadmap, trained, tmp_path_factory):
-    path = tmp_path_factory.mktemp("learning")
-    planar_roadmap.save(path / "r.grr")
-    trained.save(path / "ik.safetensors")
-    return path
 
 
 def read_dataset(path):
@@ -69,7 +54,7 @@ def read_dataset(path):
 
 
 @pytest.mark.parametrize("suffix", [".parquet", ".safetensors", ".npz"])
-def test_a_data_set_reads_back_with_names_units_and_hash(planar_roadmap, folder, tmp_path, suffix):
+def test_a_data_set_reads_back_with_names_units_and_hash(planar_roadmap, tmp_path, suffix):
     out = tmp_path / f"d{suffix}"
     counts = export_dataset(planar_roadmap, out, ROWS, jacobians=True, seed=4)
     arrays, about = read_dataset(out)
@@ -92,7 +77,8 @@ def test_a_data_set_reads_back_with_names_units_and_hash(planar_roadmap, folder,
         **dict.fromkeys(about["columns"]["jacobians"][15:], "rad/rad"),
     }
     assert about["roadmap_sha256"] == roadmap_hash(planar_roadmap)
-    assert about["roadmap_sha256"] == tensors_hash(read_file(folder / "r.grr")[1])
+    planar_roadmap.save(tmp_path / "r.grr")
+    assert about["roadmap_sha256"] == tensors_hash(read_file(tmp_path / "r.grr")[1])
     np.testing.assert_array_equal(Split(seed=4).of(planar_roadmap)(torch.from_numpy(points)), arrays["split"])
 
 
@@ -161,37 +147,37 @@ def some_points(count=300):
     return 0.5 * torch.rand(count, 2, generator=torch.Generator().manual_seed(2)) - 0.25
 
 
-def test_onnx_gives_what_the_network_gives(trained, tmp_path):
+def test_onnx_gives_what_the_network_gives(tiny_ik, tmp_path):
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
-    assert export_onnx(trained.network, trained.origin, tmp_path / "ik.onnx") < 1e-5
+    assert export_onnx(tiny_ik.network, tiny_ik.origin, tmp_path / "ik.onnx") < 1e-5
     session = runtime.InferenceSession(str(tmp_path / "ik.onnx"), providers=["CPUExecutionProvider"])
     assert [(x.name, x.type, x.shape[1]) for x in session.get_inputs()] == [("points", "tensor(float)", 2)]
     assert [(x.name, x.type, x.shape[1]) for x in session.get_outputs()] == [("configurations", "tensor(float)", 5)]
     about = json.loads(session.get_modelmeta().custom_metadata_map["grr_torch"])
-    assert about["joint_names"] == list(trained.robot.joint_names)
+    assert about["joint_names"] == list(tiny_ik.robot.joint_names)
     for count in (1, 7, 300):
         points = some_points(count)
         (q,) = session.run(None, {"points": points.numpy()})
-        np.testing.assert_allclose(q, trained(points).numpy(), atol=1e-5)
+        np.testing.assert_allclose(q, tiny_ik(points).numpy(), atol=1e-5)
 
 
-def test_torch_export_gives_what_the_network_gives(trained, tmp_path):
-    assert export_torch(trained.network, trained.origin, tmp_path / "ik.pt2") < 1e-6
+def test_torch_export_gives_what_the_network_gives(tiny_ik, tmp_path):
+    assert export_torch(tiny_ik.network, tiny_ik.origin, tmp_path / "ik.pt2") < 1e-6
     program = torch.export.load(tmp_path / "ik.pt2").module()
     for count in (1, 7, 300):
-        assert torch.allclose(program(some_points(count)).double(), trained(some_points(count)), atol=1e-6)
+        assert torch.allclose(program(some_points(count)).double(), tiny_ik(some_points(count)), atol=1e-6)
 
 
-def test_a_missing_package_is_named(trained, tmp_path, monkeypatch):
+def test_a_missing_package_is_named(tiny_ik, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     pytest.importorskip("onnxscript")
     with pytest.raises(MissingPackageError, match=r"grr-torch\[learn\]"):
-        export_onnx(trained.network, trained.origin, tmp_path / "ik.onnx")
+        export_onnx(tiny_ik.network, tiny_ik.origin, tmp_path / "ik.onnx")
     assert not list(tmp_path.iterdir())
 
 
-def test_an_export_that_differs_is_refused(trained, tmp_path, monkeypatch):
+def test_an_export_that_differs_is_refused(tiny_ik, tmp_path, monkeypatch):
     load = torch.export.load
 
     class Off:
@@ -203,7 +189,7 @@ def test_an_export_that_differs_is_refused(trained, tmp_path, monkeypatch):
 
     monkeypatch.setattr(torch.export, "load", Off)
     with pytest.raises(GrrError, match="rad from the network"):
-        export_torch(trained.network, trained.origin, tmp_path / "ik.pt2")
+        export_torch(tiny_ik.network, tiny_ik.origin, tmp_path / "ik.pt2")
     assert not list(tmp_path.iterdir())
 
 
@@ -212,7 +198,9 @@ def test_an_export_that_differs_is_refused(trained, tmp_path, monkeypatch):
 
 def test_the_same_network_is_measured_with_each_kind_of_labels(planar_roadmap):
     labels = ["roadmap", "independent-joints"]
-    outcomes = measure_learning(planar_roadmap, replace(TINY, epochs=12), labels=labels, points=500)
+    size = Architecture(width=32, depth=2, waves=4)
+    options = TrainingOptions(samples=3000, epochs=12, batch=256, architecture=size)
+    outcomes = measure_learning(planar_roadmap, options, labels=labels, points=500)
     assert [outcome.labels for outcome in outcomes] == labels
     assert [outcome.ik.origin.training["options"]["pose_weight"] for outcome in outcomes] == [1.0, 0.0]
     by_labels = {outcome.labels: outcome.evaluation for outcome in outcomes}

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import warnings
 
 import numpy as np
 import pytest
 import torch
-from grr_torch.cli.main import run as run_command
 
 import grr_torch
 from grr_torch.applications.path import save_path
@@ -27,21 +25,10 @@ def folder(planar_roadmap, tmp_path_factory):
 
 
 @pytest.fixture
-def command(folder, tmp_path, monkeypatch, capfd):
-    """Runs a command in a folder of its own; gives its exit code and what it printed."""
-    monkeypatch.chdir(tmp_path)
+def command(folder, tmp_path, run_cli):
+    """Runs a command beside a roadmap."""
     (tmp_path / "r.grr").symlink_to(folder / "r.grr")
-
-    def run(*words):
-        code = 0
-        with warnings.catch_warnings():
-            try:
-                run_command([str(word) for word in words])
-            except SystemExit as end:
-                code = end.code or 0
-        return code, *capfd.readouterr()
-
-    return run
+    return run_cli
 
 
 @pytest.fixture(scope="module")

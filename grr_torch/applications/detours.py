@@ -58,7 +58,7 @@ class Detours:
         for fresh in (False, True):
             # where the next vertex of a route cannot be gone to any more, a new way in is looked for
             rows = (left & ((arms.next_vertex[which] >= 0) | fresh)).nonzero()[0].tolist()
-            entries = self.nearest(arms.p[which], _ENTRIES) if fresh and rows else None
+            entries = self._nearest(arms.p[which], _ENTRIES) if fresh and rows else None
             tried: list[tuple[int, int, float, bool]] = []
             for row in rows:
                 cost, following = self.routes.towards(ends[row], arms.avoided[int(which[row])])
@@ -90,7 +90,7 @@ class Detours:
 
     def _arrived(self, arms: Arms, arm: int) -> bool:
         """Whether an arm is at the vertex that its route led to."""
-        return bool(self.follower.distance(arms.q[arm], self.placed[arms.next_vertex[arm]]) < _ARRIVED)
+        return bool(self.follower.distance(arms.q[arm], self._placed[arms.next_vertex[arm]]) < _ARRIVED)
 
     def _enter(
         self, arms: Arms, which: Array, result: Array, left: Mask, tried: list[tuple[int, int, float, bool]]
@@ -107,7 +107,7 @@ class Detours:
         """
         owner, vertex, lengths, on_edge = (np.array(part) for part in zip(*tried, strict=True))
         q, p = arms.q[which[owner]], arms.p[which[owner]]
-        placed, points = self.placed[vertex], self._points[vertex]
+        placed, points = self._placed[vertex], self._points[vertex]
         lines = self.follower.follow(q, p, placed, points)
         total = np.where(lines.direct | (lines.safe & on_edge), lengths + self.follower.distance(q, placed), np.inf)
         for row in dict.fromkeys(owner.tolist()):
@@ -123,8 +123,8 @@ class Detours:
 
         Of all of them, where there is no such line.
         """
-        vertices = self.nearest(goals, _ENDS)
-        apart = self.follower.distance(self.placed[vertices], goals_q[:, None])
+        vertices = self._nearest(goals, _ENDS)
+        apart = self.follower.distance(self._placed[vertices], goals_q[:, None])
         vertices = np.take_along_axis(vertices, apart.argsort(1, kind="stable"), axis=1)
         chosen, left = vertices[:, 0].copy(), np.arange(len(goals))
         # the first one that is joined is it, and it is seldom far down the list
@@ -133,19 +133,19 @@ class Detours:
             if ends.size == 0:
                 break
             q, p = (part[left].repeat(ends.shape[1], 0) for part in (goals_q, goals))
-            lines = self.follower.follow(q, p, self.placed[ends.ravel()], self._points[ends.ravel()])
+            lines = self.follower.follow(q, p, self._placed[ends.ravel()], self._points[ends.ravel()])
             joined = lines.direct.reshape(ends.shape)
             found = joined.any(1)
             chosen[left[found]] = ends[found, joined[found].argmax(1)]
             left = left[~found]
         return chosen
 
-    def nearest(self, points: Array, count: int) -> Array:
+    def _nearest(self, points: Array, count: int) -> Array:
         """(A, count) resolved vertices nearest to points (A, width)."""
         return self.solver.nearest(torch.from_numpy(points), count)[1].numpy()
 
     @cached_property
-    def placed(self) -> Array:
+    def _placed(self) -> Array:
         """(V, n) configurations of the vertices."""
         return self.solver.configurations.numpy()
 

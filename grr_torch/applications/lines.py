@@ -142,19 +142,19 @@ class Follower:
     def _aim(self, q: Array, motion: Array) -> _Aim:
         """Which points on lines with motions (B, n) are looked at: no farther than half of ε apart."""
         share = _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
-        length = norms(motion)
+        near, length = share >= _SLACK, norms(motion)
         pieces = np.maximum(np.ceil(2.0 * length / self.epsilon), 1.0)
         short = pieces <= _MOST_PIECES
         most = int(pieces[short].max()) if short.any() else 2
         on_way = np.arange(1, most + 1)
         looked = np.empty((len(q), most + 1), dtype=bool)
         looked[:, :-2] = short[:, None] & (on_way[:-1] < pieces[:, None])
-        looked[:, -2], looked[:, -1] = share < _SLACK, True
+        looked[:, -2], looked[:, -1] = ~near, True
         fractions = np.empty((len(q), most + 1), q.dtype)
         fractions[:, :-1] = on_way / pieces[:, None]
         fractions[:, -2] = np.minimum(share, 1.0)
         fractions[:, -1] = 1.0
-        return _Aim(q, share >= _SLACK, length, short, fractions, looked)
+        return _Aim(q, near, length, short, fractions, looked)
 
     def _judge(self, aim: _Aim, found: Array, reached: Mask, after: Array, p: Array, targets: Array) -> Lines:
         """Which of the lines can be followed, by configurations (B, K + 1, n) that were reached (B, K + 1) on them."""

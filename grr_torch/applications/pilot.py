@@ -54,9 +54,11 @@ class Pilot:
     def _search(self, arms: Arms, which: Array, targets: Array, holding: Mask) -> Mask:
         """Looks for nearer points to hold at, and at the targets with them, of arms that are holding (A,).
 
+        An arm waits for the turn of all, but only once, and not if its target has leapt, or a vertex on the other side
+        of a hole has come nearer.
+
         Returns:
-            (A,) the arms for which that was due in this step, whether it was their turn or they have to wait for it. An
-            arm waits once, and not if its target has leapt, or a vertex on the other side of a hole has come nearer.
+            (A,) the arms for which that was due in this step; some of them wait.
         """
         leapt = ~(norms(targets - arms.sought[which]) <= SAME_GOAL)
         wanted = holding & (leapt | ~arms.searched[which])
