@@ -36,6 +36,12 @@ def planar_roadmap(planar_5) -> grr_torch.Roadmap:
 
 
 @pytest.fixture(scope="session")
+def kinova_roadmap(kinova) -> grr_torch.Roadmap:
+    """The Kinova's, gripper down, refined."""
+    return grr_torch.build(kinova, "fixed-rotation")
+
+
+@pytest.fixture(scope="session")
 def tiny_ik(planar_roadmap) -> NeuralIK:
     """A network that has hardly learned the planar roadmap."""
     architecture = Architecture(width=32, depth=2, waves=4)

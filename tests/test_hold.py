@@ -15,8 +15,8 @@ STEPS = 30
 
 
 @pytest.fixture(scope="module")
-def roadmap(kinova) -> grr_torch.Roadmap:
-    return grr_torch.build(kinova, "fixed-rotation")
+def roadmap(kinova_roadmap) -> grr_torch.Roadmap:
+    return kinova_roadmap
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,6 @@ from grr_torch.errors import ParameterError
 from grr_torch.spaces.cliques import triangles
 
 
-@pytest.fixture(scope="module")
-def kinova_roadmap(kinova) -> grr_torch.Roadmap:
-    return grr_torch.build(kinova, "fixed-rotation")
-
-
 @pytest.fixture(scope="module", params=["planar", "kinova"])
 def roadmap(request, planar_roadmap, kinova_roadmap) -> grr_torch.Roadmap:
     return planar_roadmap if request.param == "planar" else kinova_roadmap

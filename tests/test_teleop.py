@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-import grr_torch
 from grr_torch.applications.example_paths import KINDS, example_path, middles
 from grr_torch.applications.replay import read_waypoints, replay
 from grr_torch.applications.teleoperation_log import TeleoperationLog
@@ -14,11 +13,6 @@ from grr_torch.errors import FileFormatError, ParameterError, UnknownNameError
 from grr_torch.interactive.drive import drive
 from grr_torch.interactive.session import Session
 from grr_torch.recording.teleoperation import record_teleoperation
-
-
-@pytest.fixture(scope="module")
-def kinova_roadmap(kinova):
-    return grr_torch.build(kinova, "fixed-rotation")
 
 
 @pytest.fixture(scope="module", params=["planar_5", "kinova"])

@@ -10,7 +10,6 @@ import time
 import numpy as np
 import pytest
 
-import grr_torch
 from grr_torch.errors import ParameterError
 from grr_torch.interactive.drive import drive
 from grr_torch.interactive.session import Session
@@ -26,12 +25,11 @@ pytest.importorskip("viser", reason="viser is not installed")
 
 
 @pytest.fixture(scope="module")
-def opened(kinova):
+def opened(kinova_roadmap):
     """A page that is driven in the background, and its session."""
     from grr_torch.interactive.page import Page
 
-    roadmap = grr_torch.build(kinova, "fixed-rotation")
-    session = Session(roadmap)
+    session = Session(kinova_roadmap)
     page = Page(session, port=0)
     stop = threading.Event()
     loop = threading.Thread(target=drive, args=(session, page.show, stop))

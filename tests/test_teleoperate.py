@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from teleoperated import follow_targets, some_vertices
 
 import grr_torch
 from grr_torch.applications.routes import Routes
@@ -11,15 +12,8 @@ from grr_torch.errors import ParameterError
 
 
 @pytest.fixture(scope="module")
-def roadmap(kinova) -> grr_torch.Roadmap:
-    return grr_torch.build(kinova, "fixed-rotation")
-
-
-def _vertices(roadmap: grr_torch.Roadmap, count: int, seed: int = 0) -> torch.Tensor:
-    """Resolved vertices of one connected part."""
-    resolved = roadmap.resolved.nonzero()[:, 0]
-    order = torch.randperm(len(resolved), generator=torch.Generator().manual_seed(seed))
-    return resolved[order[:count]]
+def roadmap(kinova_roadmap) -> grr_torch.Roadmap:
+    return kinova_roadmap
 
 
 def _hostile(roadmap: grr_torch.Roadmap, arms: int, steps: int, seed: int) -> torch.Tensor:
@@ -32,11 +26,6 @@ def _hostile(roadmap: grr_torch.Roadmap, arms: int, steps: int, seed: int) -> to
     return held + walk.cumsum(0)
 
 
-def _follow(teleoperator: Teleoperator, targets: torch.Tensor) -> tuple[torch.Tensor, np.ndarray]:
-    commands = [teleoperator.step(target) for target in targets]
-    return torch.stack([c.configuration for c in commands]), np.stack([c.status for c in commands])
-
-
 def _between(q: torch.Tensor, count: int = 8) -> torch.Tensor:
     """Configurations (steps − 1, count, …) between successive ones."""
     fractions = torch.arange(1, count + 1, dtype=q.dtype).reshape(-1, *[1] * (q.ndim - 1)) / count
@@ -46,9 +35,9 @@ def _between(q: torch.Tensor, count: int = 8) -> torch.Tensor:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_no_step_is_too_long_or_through_a_collision_whatever_the_targets(roadmap, seed):
     robot = roadmap.robot
-    start = roadmap.configurations[_vertices(roadmap, 8, seed)]
+    start = roadmap.configurations[some_vertices(roadmap, 8, seed)]
     teleoperator = Teleoperator(roadmap, start=start)
-    q, status = _follow(teleoperator, _hostile(roadmap, 8, 90, seed))
+    q, status = follow_targets(teleoperator, _hostile(roadmap, 8, 90, seed))
     q = torch.cat([start[None], q])
     assert bool((q.diff(dim=0).abs() <= robot.velocity_limits / 50.0).all())
     assert not bool(robot.in_self_collision(_between(q)).any())
@@ -57,10 +46,10 @@ def test_no_step_is_too_long_or_through_a_collision_whatever_the_targets(roadmap
 
 
 def test_a_reachable_target_is_reached_and_held(roadmap):
-    vertices = _vertices(roadmap, 24, 3)
+    vertices = some_vertices(roadmap, 24, 3)
     start, goals = roadmap.configurations[vertices[:12]], roadmap.points[vertices[12:]]
     teleoperator = Teleoperator(roadmap, start=start, max_step=0.1)
-    q, status = _follow(teleoperator, goals.expand(150, -1, -1))
+    q, status = follow_targets(teleoperator, goals.expand(150, -1, -1))
     apart = (roadmap.robot.forward_kinematics(q[-1])[0] - goals).norm(dim=1)
     assert float(apart.max()) < 1e-3
     assert (status[-1] == "tracking").all()
@@ -68,85 +57,18 @@ def test_a_reachable_target_is_reached_and_held(roadmap):
 
 
 def test_the_arm_ends_at_the_maps_configuration_whatever_way_it_came(roadmap):
-    vertices = _vertices(roadmap, 7, 5)
+    vertices = some_vertices(roadmap, 7, 5)
     goal = roadmap.points[vertices[0]]
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertices[1:]], max_step=0.1)
-    q, _ = _follow(teleoperator, goal.expand(150, 6, -1))
+    q, _ = follow_targets(teleoperator, goal.expand(150, 6, -1))
     apart = grr_torch.spaces.configuration.distance(q[-1], q[-1, :1], roadmap.robot.continuous)
     assert float(apart.max()) < 1e-3
 
 
-def test_targets_out_of_reach_are_approached_and_slid_along(roadmap):
-    centre, radius = torch.tensor([0.0, 0.0, 0.3], dtype=torch.float64), 1.6
-    angles = torch.linspace(0.0, 1.0, 120, dtype=torch.float64)
-    targets = centre + radius * torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], dim=1)
-    vertex = roadmap.solver.nearest(targets[:1])[1][0, 0]
-    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex])
-    q, status = _follow(teleoperator, targets)
-    tool = roadmap.robot.forward_kinematics(q)[0]
-    assert set(status[20:]) <= {"unreachable", "detouring"}
-    azimuth = torch.atan2(tool[:, 1], tool[:, 0])
-    assert float((azimuth[40:] - angles[40:]).abs().max()) < 0.45
-    # no freeze: at 50 Hz it does not stand still for half a second
-    still = (q.diff(dim=0).abs().amax(1) < 1e-4).numpy()
-    longest = max((len(run) for run in "".join("x" if s else " " for s in still[40:]).split()), default=0)
-    assert longest < 25
-
-
-def _unreachable(roadmap, count, seed):
-    """Points (count, 3) a little beyond the edge of reach, and configurations of arms that hold there."""
-    vertices = _vertices(roadmap, count, seed)
-    points, q = roadmap.points[vertices], roadmap.configurations[vertices]
-    return 1.5 * points / points.norm(dim=1, keepdim=True), q
-
-
-@pytest.mark.parametrize("phase", [0, 1])
-def test_input_that_is_refused_every_other_time_hides_no_target(roadmap, phase):
-    """As from trackers at half the rate, in turn: arms hold out of reach, then their targets come back a little."""
-    out, start = _unreachable(roadmap, 12, 11)
-    teleoperator = Teleoperator(roadmap, start=start, max_step=0.1)
-    arms = torch.arange(12)
-
-    def follow(goals, steps):
-        for step in range(steps):
-            given = (arms + step) % 2 == phase
-            command = teleoperator.step(torch.where(given[:, None], goals, torch.nan))
-        return command
-
-    follow(out, 120)
-    held = torch.from_numpy(teleoperator._arms.held)
-    assert bool(held.isfinite().all())
-    # nearer to the held point than to any vertex
-    goals = 0.97 * held
-    solvable = roadmap.solve(goals).valid
-    assert int(solvable.sum()) >= 6
-    command = follow(goals, 40)
-    apart = (roadmap.robot.forward_kinematics(command.configuration)[0] - goals).norm(dim=1)
-    assert float(apart[solvable].max()) < 1e-3
-
-
-def test_a_target_that_becomes_solvable_is_noticed_on_a_detour_too(roadmap):
-    """Arms on the way to where they will hold, across the base, when each target comes back a little."""
-    vertices = _vertices(roadmap, 40, 13)
-    start, points = roadmap.configurations[vertices], roadmap.points[vertices]
-    out = points * torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
-    out = 1.3 * out / out.norm(dim=1, keepdim=True)
-    teleoperator = Teleoperator(roadmap, start=start)
-    for _ in range(13):
-        command = teleoperator.step(out)
-    arms = teleoperator._arms
-    goals = 0.97 * torch.from_numpy(arms.held)
-    changed = torch.from_numpy(command.status == "detouring") & roadmap.solve(goals).valid
-    assert int(changed.sum()) >= 8
-    for _ in range(6):
-        teleoperator.step(goals)
-    assert not arms.holds(changed.nonzero()[:, 0].numpy()).any()
-
-
 def test_an_arm_on_its_task_keeps_it_while_it_tracks(roadmap):
-    vertices = _vertices(roadmap, 10, 7)
+    vertices = some_vertices(roadmap, 10, 7)
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertices[:5]])
-    q, status = _follow(teleoperator, roadmap.points[vertices[5:]].expand(120, -1, -1))
+    q, status = follow_targets(teleoperator, roadmap.points[vertices[5:]].expand(120, -1, -1))
     position, rotation = roadmap.robot.forward_kinematics(q.reshape(-1, 7))
     error = roadmap.task.error(position.T, position.T, rotation.permute(1, 2, 0))
     turned = roadmap.task.residuals(error)[1].reshape(status.shape)
@@ -160,9 +82,9 @@ def test_any_measured_start_comes_back_to_the_map(roadmap, seed):
     start = robot.sample(40, torch.Generator().manual_seed(seed))
     start[:5, 1] = 2.6
     start = start[~robot.in_self_collision(start)][:10]
-    goal = roadmap.points[_vertices(roadmap, 1, seed)[0]]
+    goal = roadmap.points[some_vertices(roadmap, 1, seed)[0]]
     teleoperator = Teleoperator(roadmap, start=start, max_step=0.1)
-    q, _ = _follow(teleoperator, goal.expand(220, len(start), -1))
+    q, _ = follow_targets(teleoperator, goal.expand(220, len(start), -1))
     assert bool((torch.cat([start[None], q]).diff(dim=0).abs() <= 0.1).all())
     assert not bool(robot.in_self_collision(_between(torch.cat([start[None], q]))).any())
     apart = (robot.forward_kinematics(q[-1])[0] - goal).norm(dim=1)
@@ -174,7 +96,7 @@ def test_from_a_contact_it_never_goes_deeper(roadmap):
     start = robot.sample(4000, torch.Generator().manual_seed(3))
     start = start[robot.in_self_collision(start)][:8]
     teleoperator = Teleoperator(roadmap, start=start)
-    q, _ = _follow(teleoperator, roadmap.points[_vertices(roadmap, 8, 3)].expand(120, -1, -1))
+    q, _ = follow_targets(teleoperator, roadmap.points[some_vertices(roadmap, 8, 3)].expand(120, -1, -1))
     clearance = robot.self_collision_distance(torch.cat([start[None], q])) - robot.margin
     deepest = clearance.clamp_max(0.0)
     assert bool((deepest.diff(dim=0) >= -1e-6).all())
@@ -182,10 +104,10 @@ def test_from_a_contact_it_never_goes_deeper(roadmap):
 
 
 def test_acceleration_limits_hold_and_arms_still_arrive(roadmap):
-    vertices = _vertices(roadmap, 12, 11)
+    vertices = some_vertices(roadmap, 12, 11)
     start, goals = roadmap.configurations[vertices[:6]], roadmap.points[vertices[6:]]
     teleoperator = Teleoperator(roadmap, start=start, acceleration_limits=3.0)
-    q, _ = _follow(teleoperator, goals.expand(400, -1, -1))
+    q, _ = follow_targets(teleoperator, goals.expand(400, -1, -1))
     q = torch.cat([start[None], start[None], q])
     speed = q.diff(dim=0) * 50.0
     assert bool((speed.abs() <= roadmap.robot.velocity_limits * (1.0 + 1e-9)).all())
@@ -196,15 +118,15 @@ def test_acceleration_limits_hold_and_arms_still_arrive(roadmap):
 
 
 def test_many_arms_are_the_same_as_one_at_a_time(roadmap):
-    vertices = _vertices(roadmap, 6, 13)
+    vertices = some_vertices(roadmap, 6, 13)
     targets = _hostile(roadmap, 6, 40, 4)
     together = Teleoperator(roadmap, start=roadmap.configurations[vertices].reshape(3, 1, 2, 7))
-    q, status = _follow(together, targets.reshape(40, 3, 1, 2, 3))
+    q, status = follow_targets(together, targets.reshape(40, 3, 1, 2, 3))
     assert q.shape == (40, 3, 1, 2, 7)
     assert status.shape == (40, 3, 1, 2)
     for arm in range(6):
         alone = Teleoperator(roadmap, start=roadmap.configurations[vertices[arm]])
-        single, _ = _follow(alone, targets[:8, arm])
+        single, _ = follow_targets(alone, targets[:8, arm])
         assert torch.allclose(single, q.reshape(40, 6, 7)[:8, arm], atol=1e-6)
 
 
@@ -212,14 +134,14 @@ def test_joints_are_not_wrapped(planar_roadmap):
     """Round the base, joint values go on beyond π."""
     angles = torch.linspace(0.0, 4.0 * torch.pi, 400, dtype=torch.float64)
     targets = 0.6 * torch.stack([angles.cos(), angles.sin()], dim=1)
-    q, _ = _follow(Teleoperator(planar_roadmap, max_step=0.2), targets)
+    q, _ = follow_targets(Teleoperator(planar_roadmap, max_step=0.2), targets)
     assert float(q.diff(dim=0).abs().max()) <= 0.2
     assert float((q[-1, 0] - q[0, 0]).abs()) > 6.0
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_a_target_that_is_not_finite_is_refused_and_held(roadmap, bad):
-    vertices = _vertices(roadmap, 2, 1)
+    vertices = some_vertices(roadmap, 2, 1)
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertices])
     target = roadmap.points[vertices].clone()
     target[0, 1] = bad
@@ -231,7 +153,7 @@ def test_a_target_that_is_not_finite_is_refused_and_held(roadmap, bad):
 
 
 def test_a_far_jump_is_refused_until_reset(roadmap):
-    first, second = _vertices(roadmap, 2, 2)
+    first, second = some_vertices(roadmap, 2, 2)
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[first], max_jump=0.05)
     assert teleoperator.step(roadmap.points[first]).status == "tracking"
     held = teleoperator.step(roadmap.points[second])
@@ -242,7 +164,7 @@ def test_a_far_jump_is_refused_until_reset(roadmap):
 
 
 def test_old_input_is_refused(roadmap):
-    vertex = _vertices(roadmap, 1, 4)[0]
+    vertex = some_vertices(roadmap, 1, 4)[0]
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex], timeout=0.1)
     point = roadmap.points[vertex]
     for step in range(10):
@@ -256,7 +178,7 @@ def test_old_input_is_refused(roadmap):
 
 
 def test_after_the_clutch_it_starts_where_the_arm_is(roadmap):
-    first, second = _vertices(roadmap, 2, 6)
+    first, second = some_vertices(roadmap, 2, 6)
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[first])
     teleoperator.step(roadmap.points[first])
     teleoperator.reset(roadmap.configurations[second])
@@ -285,7 +207,7 @@ def test_bad_parameters_are_refused(roadmap, arguments, what):
 
 @pytest.mark.parametrize("target", [torch.zeros(2), torch.zeros(5, 3), [0.1, 0.2, 0.3], torch.tensor(0.5)])
 def test_targets_of_another_shape_are_refused(roadmap, target):
-    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[_vertices(roadmap, 1)[0]])
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[some_vertices(roadmap, 1)[0]])
     with pytest.raises(ParameterError, match="target"):
         teleoperator.step(target)
 
@@ -308,22 +230,9 @@ def test_a_robot_in_single_precision_is_solved_for_and_teleoperated(tmp_path, ag
             assert bool(arm.step(target).configuration.isfinite().all())
 
 
-def test_no_arm_stays_on_a_detour_that_leads_nowhere(roadmap):
-    """Near the base's axis edges are connected that lead through long self-motions, and so cannot be followed."""
-    target = torch.tensor([0.0, 0.05, 0.52], dtype=torch.float64)
-    near = roadmap.resolved & ((roadmap.points - target).norm(dim=1) < 0.35)
-    start = roadmap.configurations[near]
-    assert len(start) > 20
-    q, status = _follow(Teleoperator(roadmap, max_step=0.04, start=start), target.expand(260, len(start), 3))
-    still = (q[-10:].diff(dim=0).abs().amax(dim=(0, 2)) < 1e-6).numpy()
-    assert not (still & (status[-1] == "detouring")).any()
-    away = (roadmap.robot.forward_kinematics(q[-1])[0] - target).norm(dim=1)
-    assert float((away < 0.15).double().mean()) > 0.8
-
-
 def test_routes_leave_out_the_edges_that_are_avoided(roadmap):
     routes = Routes(roadmap)
-    goal, start = _vertices(roadmap, 2, 17).tolist()
+    goal, start = some_vertices(roadmap, 2, 17).tolist()
     cost, following = routes.towards(goal)
     avoided: frozenset[tuple[int, int]] = frozenset()
     for _ in range(3):
@@ -336,20 +245,10 @@ def test_routes_leave_out_the_edges_that_are_avoided(roadmap):
     assert routes.towards(goal)[0][start] < cost[start], "others still take them"
 
 
-@pytest.mark.filterwarnings("error")
-def test_targets_beyond_all_numbers_are_only_far_away(roadmap):
-    start = roadmap.configurations[_vertices(roadmap, 1)]
-    teleoperator = Teleoperator(roadmap, start=start)
-    for _ in range(5):
-        command = teleoperator.step(torch.full((1, 3), 1e300, dtype=torch.float64))
-    assert bool(command.configuration.isfinite().all())
-    assert command.status[0] in ("unreachable", "detouring", "holding")
-
-
 def test_no_arms_are_no_error_and_starts_may_have_gradients(roadmap):
     nobody = Teleoperator(roadmap, start=torch.zeros(0, 7, dtype=torch.float64))
     command = nobody.step(torch.zeros(0, 3, dtype=torch.float64))
     assert command.configuration.shape == (0, 7)
     assert command.status.shape == (0,)
-    start = roadmap.configurations[_vertices(roadmap, 1)].requires_grad_()
+    start = roadmap.configurations[some_vertices(roadmap, 1)].requires_grad_()
     assert not Teleoperator(roadmap, start=start).step(torch.zeros(1, 3)).configuration.requires_grad

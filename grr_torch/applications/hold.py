@@ -65,11 +65,13 @@ def nearest_feasible(
     left = norms(points - targets[:, None])
     tried = (left < left[:, :1]) | ~known[:, None]
     tried[:, [0, -1]] = True
-    solved, fits = np.zeros_like(tried), np.zeros_like(tried)
+    solved = np.zeros_like(tried)
     q = np.full((*tried.shape, base_q.shape[1]), np.nan, base.dtype)
     q[tried], solved[tried], strayed = _solve(follower, solver, points[tried])
-    # near full stretch, much joint motion brings little
-    fits[tried] = solved[tried] & (strayed <= _STRETCHED)
+    # near full stretch, much joint motion brings little; no farther into it than where the arm is
+    stretched = np.zeros(tried.shape, base.dtype)
+    stretched[tried] = np.nan_to_num(strayed)
+    fits = solved & (stretched <= np.maximum(_STRETCHED, stretched[:, :1]))
     reach = _SLOPE * norms(points - base[:, None]) + _LEAST
     moved = np.where(known[:, None], follower.distance(q, np.nan_to_num(base_q)[:, None]), 0.0)
     fits &= moved <= reach

@@ -98,7 +98,15 @@ class Follower:
         """ε of the continuity check: 0.05 √n [rad]."""
         return 0.05 * math.sqrt(self.robot.n)
 
-    def follow(self, q: Array, p: Array, guesses: Array, targets: Array, offsets: Array | None = None) -> Lines:
+    def follow(
+        self,
+        q: Array,
+        p: Array,
+        guesses: Array,
+        targets: Array,
+        offsets: Array | None = None,
+        pace: Array | float = 1.0,
+    ) -> Lines:
         """Follows lines, all their points at once.
 
         It asks what the recursion of IsContinuous asks where it ends: points on the line whose configurations are
@@ -112,9 +120,10 @@ class Follower:
             targets: (B, width) the ends.
             offsets: (B, n) what the ends are expected to differ from their guesses by, as they did in the last step:
                 lines lead there, so that steps are not short where guesses are far off. By default nothing.
+            pace: (B,) the most of a line that one step covers.
         """
         motion = self.difference(q, guesses if offsets is None else guesses + offsets)
-        aim = self._aim(q, motion)
+        aim = self._aim(q, motion, pace)
         rows = aim.looked.nonzero()[0]
         fraction = aim.fractions[aim.looked][:, None]
         on_way = p[rows] + fraction * (targets - p)[rows]
@@ -139,9 +148,9 @@ class Follower:
         solved, valid = project_columns(self.robot, self.task, *columns, self.tolerances, check_collision=False)
         return solved.numpy(), valid.numpy()
 
-    def _aim(self, q: Array, motion: Array) -> _Aim:
+    def _aim(self, q: Array, motion: Array, pace: Array | float) -> _Aim:
         """Which points on lines with motions (B, n) are looked at: no farther than half of ε apart."""
-        share = _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
+        share = np.minimum(self.share(motion), pace)
         near, length = share >= _SLACK, norms(motion)
         pieces = np.maximum(np.ceil(2.0 * length / self.epsilon), 1.0)
         short = pieces <= _MOST_PIECES
@@ -155,6 +164,10 @@ class Follower:
         fractions[:, -2] = np.minimum(share, 1.0)
         fractions[:, -1] = 1.0
         return _Aim(q, near, length, short, fractions, looked)
+
+    def share(self, motion: Array) -> Array:
+        """(B,) how much of motions (B, n) one step covers."""
+        return _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
 
     def _judge(self, aim: _Aim, found: Array, reached: Mask, after: Array, p: Array, targets: Array) -> Lines:
         """Which of the lines can be followed, by configurations (B, K + 1, n) that were reached (B, K + 1) on them."""

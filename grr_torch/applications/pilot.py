@@ -8,7 +8,7 @@ import torch
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.detours import SAME_GOAL, Detours
 from grr_torch.applications.hold import much_nearer, nearest_feasible
-from grr_torch.applications.lines import Follower, norms
+from grr_torch.applications.lines import Follower, Lines, norms
 from grr_torch.applications.rejoin import rejoin
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
@@ -17,8 +17,11 @@ from grr_torch.pieces import Array, Mask
 
 # vertices that are tried as a way back to the map
 _WAYS_BACK = 32
-# the most that a guess is expected to be off by [rad]; less than what the solver calls off the map
-_OFFSET = 0.3
+# a configuration so near the guess that led to it [rad] is on the map; less than what the solver calls off it. Where it
+# is farther, the arm is near full stretch, where it goes slowly: so much joint motion brings little
+_NEAR = 0.3
+# steps in which an arm goes to a new point to hold at: searches that look far and closely find one in four, or two
+_GRADUALLY = 4
 # an arm so near [rad or m] to the map's configuration at its place is on the map
 _ON_MAP = 0.05
 
@@ -75,94 +78,106 @@ class Pilot:
     def _look(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """`steps` of arms that look where they can go."""
         lost = arms.holds(which) & ~arms.solvable[which]
+        steps, ends, valid, direct = self._straight(arms, which, targets, lost)
         arms.searched[which] = False
-        steps, ends, valid, direct = self._straight(arms, which, targets, ~lost)
-        arms.forget(which[direct])
-        if direct.all():
-            return steps
-        fresh = ~valid & ~lost
-        if fresh.any():
+        arms.forget(which[direct & ~lost])
+        arms.on_map[which[direct & ~lost]] = True
+        fresh = (~valid & ~lost).nonzero()[0]
+        if len(fresh):
             self._hold(arms, which[fresh], targets[fresh])
-        rest = ~direct
-        steps.put(rest, self._indirect(arms, which[rest], targets[rest], valid[rest], ends[rest]))
+            again, ends[fresh], _, direct[fresh] = self._straight(
+                arms, which[fresh], targets[fresh], np.ones(len(fresh), dtype=bool)
+            )
+            steps.put(fresh, again)
+        arms.next_vertex[which[direct]] = -1
+        if not direct.all():
+            rest = ~direct
+            steps.put(rest, self._indirect(arms, which[rest], targets[rest], valid[rest], ends[rest]))
         return steps
 
-    def _straight(self, arms: Arms, which: Array, targets: Array, solvable: Mask) -> tuple[Steps, Array, Mask, Mask]:
-        """Steps straight to targets (A, width), as far as these are solvable (A,).
+    def _straight(self, arms: Arms, which: Array, targets: Array, lost: Mask) -> tuple[Steps, Array, Mask, Mask]:
+        """Steps straight to targets (A, width), or to where those arms hold that are `lost` (A,).
 
         Returns:
-            The steps; configurations (A, n) at the targets; which targets (A,) the map has a configuration for; and
-            which arms (A,) can go straight to it.
+            The steps; configurations (A, n) where they lead; which targets (A,) the map has a configuration for; and
+            which arms (A,) can go straight.
         """
         steps = Steps.none_yet(arms, which)
-        ends = np.full_like(steps.q, np.nan)
-        valid, direct = np.zeros_like(solvable), np.zeros_like(solvable)
-        rows = solvable.nonzero()[0]
+        ends, known = np.full_like(steps.q, np.nan), lost.copy()
+        ends[lost] = arms.held_q[which[lost]]
+        rows = (~lost).nonzero()[0]
         if len(rows):
             points = torch.from_numpy(targets[rows].astype(np.float64))
             guesses, codes = (part.numpy() for part in self.solver.guess(points, certified=False))
-            near = codes <= 1
-            rows, guesses = rows[near], guesses[near].astype(targets.dtype)
+            ends[rows], known[rows] = guesses, codes <= 1
+        valid, direct = np.zeros_like(lost), np.zeros_like(lost)
+        rows = known.nonzero()[0]
         if len(rows):
-            chosen = which[rows]
-            lines = self.follower.follow(arms.q[chosen], arms.p[chosen], guesses, targets[rows], arms.offsets[chosen])
-            offsets = self.follower.difference(guesses, lines.ends)
-            fits = lines.converged & (norms(offsets) <= _OFFSET)
-            arms.offsets[chosen] = np.where(fits[:, None], offsets, 0.0)
-            found = lines.converged & ~lines.collides
-            # what is near its guess is on the map
-            far = (found & ~fits).nonzero()[0]
-            if len(far):
-                found[far] = self.solver.on_map(
-                    *(torch.from_numpy(part[far]) for part in (lines.ends, guesses))
-                ).numpy()
-            free = found & lines.direct & arms.on_task[chosen]
-            direct[rows], valid[rows] = free, free | (found & ~arms.barred_from(chosen, targets[rows], SAME_GOAL))
-            ends[rows] = lines.ends
+            chosen, lost = which[rows], lost[rows]
+            goals = np.where(lost[:, None], arms.held[chosen], targets[rows])
+            lines, found = self._lines(arms, chosen, goals, ends[rows], lost)
+            free = (found | lost) & lines.direct & arms.on_task[chosen]
+            direct[rows], valid[rows] = free, found & (free | ~arms.barred_from(chosen, goals, SAME_GOAL))
+            ends[rows[~lost]] = lines.ends[~lost]
             steps.q[rows[free]], steps.goals[rows[free]] = lines.steps[free], lines.ends[free]
-            steps.points[rows[free]], steps.codes[rows[free]] = lines.points[free], TRACKING
+            steps.points[rows[free]] = lines.points[free]
+            steps.codes[rows[free]] = np.where(lost, UNREACHABLE, TRACKING)[free]
         return steps, ends, valid, direct
+
+    def _lines(self, arms: Arms, which: Array, goals: Array, guesses: Array, lost: Mask) -> tuple[Lines, Mask]:
+        """Lines to goals (A, width), and which of these the map has a configuration for (A,), by its guesses (A, n).
+
+        Arms that are `lost` (A,) go to where they hold, in as many steps as are left for that.
+        """
+        offsets = np.where(lost[:, None], 0.0, arms.offsets[which])
+        pace = np.where(lost, 1.0 / arms.due[which], 1.0)
+        arms.due[which] = np.maximum(arms.due[which] - 1, 1)
+        stretched = (norms(offsets) > _NEAR).nonzero()[0]
+        if len(stretched):
+            motion = self.follower.difference(arms.q[which[stretched]], guesses[stretched])
+            pace[stretched] = self.follower.share(motion)
+        lines = self.follower.follow(arms.q[which], arms.p[which], guesses, goals, offsets, pace)
+        offsets = self.follower.difference(guesses, lines.ends)
+        found = ~lost & lines.converged & ~lines.collides
+        far = found & ~(norms(offsets) <= _NEAR)
+        if far.any():
+            both = (torch.from_numpy(part[far]) for part in (lines.ends, guesses))
+            found[far] = self.solver.on_map(*both).numpy()
+        arms.offsets[which[~lost]] = np.where(found[:, None], offsets, 0.0)[~lost]
+        return lines, found
 
     def _hold(self, arms: Arms, which: Array, targets: Array) -> None:
         """Looks for the nearest points to targets (A, width) that arms can hold at, and whether these are solvable."""
         unset = ~arms.holds(which)
         base = np.where(unset[:, None], arms.p[which], arms.held[which])
         # what is not to be gone to by any route must not be where a jump leads
-        near = unset & arms.barred_from(which, targets, SAME_GOAL)
-        base_q = np.where(near[:, None], arms.q[which], arms.held_q[which])
+        here = unset & (arms.on_map[which] | arms.barred_from(which, targets, SAME_GOAL))
+        base_q = np.where(here[:, None], arms.q[which], arms.held_q[which])
         closely = arms.closely[which] & ~unset
         found = nearest_feasible(self.follower, self.solver, base, base_q, targets, closely)
+        arms.due[which[norms(found[0] - arms.held[which]) != 0.0]] = _GRADUALLY
         arms.held[which], arms.held_q[which], arms.solvable[which] = found
         arms.closely[which], arms.searched[which], arms.sought[which] = ~closely, True, targets
 
     def _indirect(self, arms: Arms, which: Array, targets: Array, valid: Mask, ends: Array) -> Steps:
         """`steps` of arms that cannot go straight to their targets.
 
-        Those that have a configuration there (`ends`, where `valid`) are on the way to it, others to where they hold.
+        Those of which the map has a configuration there, where `valid`, are on the way to it, others to where they
+        hold; `ends` are the configurations that they are on the way to.
         """
-        goals, goals_q = targets.copy(), ends.copy()
-        steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
         arms.held[which[valid]], arms.held_q[which[valid]] = np.nan, np.nan
-        lost = (~valid).nonzero()[0]
-        if len(lost):
-            chosen = which[lost]
-            goals[lost], goals_q[lost] = arms.held[chosen], arms.held_q[chosen]
-            lines = self.follower.follow(arms.q[chosen], arms.p[chosen], goals_q[lost], goals[lost])
-            straight = lines.direct & arms.on_task[chosen]
-            rows = lost[straight]
-            arms.next_vertex[which[rows]] = -1
-            steps.q[rows], steps.goals[rows] = lines.steps[straight], lines.ends[straight]
-            steps.points[rows], steps.codes[rows], left[rows] = lines.points[straight], UNREACHABLE, False
+        goals = np.where(valid[:, None], targets, arms.held[which])
+        steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
         routed = (left & arms.on_task[which]).nonzero()[0]
         if len(routed):
             chosen = which[routed]
-            self.detours.set_goals(arms, chosen, goals[routed], goals_q[routed])
+            self.detours.set_goals(arms, chosen, goals[routed], ends[routed])
             steps.q[routed], left[routed] = self.detours.follow(arms, chosen, np.ones(len(chosen), dtype=bool))
             arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[routed]
             found = ~left[routed]
             self.detours.give_up_ended(arms, chosen[found], steps.q[routed[found]], targets[routed[found]])
         for row in left.nonzero()[0].tolist():
-            step = self._back(arms, int(which[row]), goals_q[row])
+            step = self._back(arms, int(which[row]), ends[row])
             if step is None:
                 steps.codes[row] = HOLDING
             else:
