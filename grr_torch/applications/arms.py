@@ -39,6 +39,7 @@ class Arms:
         blind: (B,) steps for which an arm on a route follows it before it looks for a straight way to its target again.
         aimed: (B, width) the target for which it does so; a target elsewhere is looked for at once.
         doubt: (B,) how many these are the next time.
+        hesitated: (B,) steps for which an arm has waited before a detour since it last went straight.
         offsets: (B, n) what the last end of a line differed from its guess by.
         barred: (B, width) the last target that a route led near, without a way on from there; NaN where there is none.
         avoided: Of each arm, the edges that it could not follow since it last went straight.
@@ -64,6 +65,7 @@ class Arms:
     blind: Array
     aimed: Array
     doubt: Array
+    hesitated: Array
     offsets: Array
     barred: Array
     avoided: list[frozenset[tuple[int, int]]]
@@ -98,6 +100,7 @@ class Arms:
             blind=np.zeros(count, dtype=np.int64),
             aimed=unknown(width),
             doubt=np.ones(count, dtype=np.int64),
+            hesitated=np.zeros(count, dtype=np.int64),
             offsets=np.zeros_like(q),
             barred=unknown(width),
             avoided=[frozenset()] * count,
@@ -128,6 +131,6 @@ class Arms:
         for nothing in (self.held, self.held_q, self.barred):
             nothing[which] = np.nan
         self.next_vertex[which] = -1
-        self.blind[which] = 0
+        self.blind[which], self.hesitated[which] = 0, 0
         for arm in which.tolist():
             self.avoided[arm] = frozenset()

@@ -22,6 +22,8 @@ _WAYS_BACK = 32
 _NEAR = 0.3
 # steps in which an arm goes to a new point to hold at: searches that look far and closely find one in four, or two
 _GRADUALLY = 4
+# steps for which an arm waits before it turns round for a target that is next to it
+_HESITATION = 2
 # an arm so near [rad or m] to the map's configuration at its place is on the map
 _ON_MAP = 0.05
 
@@ -90,10 +92,23 @@ class Pilot:
             )
             steps.put(fresh, again)
         arms.next_vertex[which[direct]] = -1
-        if not direct.all():
-            rest = ~direct
+        done = direct | self._hesitate(arms, which, targets, valid & ~direct, steps)
+        if not done.all():
+            rest = ~done
             steps.put(rest, self._indirect(arms, which[rest], targets[rest], valid[rest], ends[rest]))
         return steps
+
+    def _hesitate(self, arms: Arms, which: Array, targets: Array, turned: Mask, steps: Steps) -> Mask:
+        """Which of the arms (A,) whose way has just `turned` into a detour (A,) wait instead of setting off on it.
+
+        At the edge of a hole a target next to the tool often is one of a few steps that are on the other side of a
+        self-motion, and the arm would turn round for them.
+        """
+        near = norms(targets - arms.p[which]) <= SAME_GOAL
+        waits = turned & near & (arms.next_vertex[which] < 0) & (arms.hesitated[which] < _HESITATION)
+        arms.hesitated[which[waits]] += 1
+        steps.points[waits], steps.codes[waits] = arms.p[which[waits]], HOLDING
+        return waits
 
     def _straight(self, arms: Arms, which: Array, targets: Array, lost: Mask) -> tuple[Steps, Array, Mask, Mask]:
         """Steps straight to targets (A, width), or to where those arms hold that are `lost` (A,).
