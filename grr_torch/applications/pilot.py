@@ -45,15 +45,13 @@ class Pilot:
         blind = on_route & (arms.blind[which] > 0) & (norms(targets - arms.aimed[which]) <= SAME_GOAL)
         arms.blind[which[blind]] -= 1
         wanted = self._search(arms, which, targets, arms.holds(which) & ~blind)
-        if not on_route.any():
-            return self._look(arms, which, targets)
-        steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
-        on_way = (blind | wanted & on_route).nonzero()[0]
-        if len(on_way):
-            steps.q[on_way], left[on_way] = self.detours.follow(arms, which[on_way], wanted[on_way])
-        rest = left.nonzero()[0]
-        if len(rest):
-            steps.put(rest, self._look(arms, which[rest], targets[rest]))
+        steps, ends = Steps.none_yet(arms, which), np.full_like(arms.q[which], np.nan)
+        looks, on_way = ~blind & ~(wanted & on_route), blind | wanted & on_route
+        # all routes at once; whose way has come to nothing looks for another
+        while looks.any() or on_way.any():
+            routed = self._look(arms, which, targets, looks, steps, ends)
+            looks = self._lead(arms, which, targets, routed, on_way, wanted, steps, ends)
+            on_way = np.zeros_like(on_way)
         return steps
 
     def _search(self, arms: Arms, which: Array, targets: Array, holding: Mask) -> Mask:
@@ -77,26 +75,46 @@ class Pilot:
             self._hold(arms, which[search], targets[search])
         return wanted
 
-    def _look(self, arms: Arms, which: Array, targets: Array) -> Steps:
-        """`steps` of arms that look where they can go."""
+    def _look(self, arms: Arms, who: Array, targets: Array, looks: Mask, steps: Steps, ends: Array) -> Mask:
+        """Sets the steps of arms that look where they can go.
+
+        Args:
+            arms: All arms.
+            who: (A,) some of them, and
+            targets: (A, width) theirs.
+            looks: (A,) those that look.
+            steps: Their steps.
+            ends: (A, n) configurations that they are on the way to, which are set.
+
+        Returns:
+            (A,) those that cannot go straight, but by a route.
+        """
+        routed, rows = np.zeros_like(looks), looks.nonzero()[0]
+        if len(rows) == 0:
+            return routed
+        which, targets = who[rows], targets[rows]
         lost = arms.holds(which) & ~arms.solvable[which]
-        steps, ends, valid, direct = self._straight(arms, which, targets, lost)
+        made, found, valid, direct = self._straight(arms, which, targets, lost)
         arms.searched[which] = False
         arms.forget(which[direct & ~lost])
         arms.on_map[which[direct & ~lost]] = True
         fresh = (~valid & ~lost).nonzero()[0]
         if len(fresh):
             self._hold(arms, which[fresh], targets[fresh])
-            again, ends[fresh], _, direct[fresh] = self._straight(
-                arms, which[fresh], targets[fresh], np.ones(len(fresh), dtype=bool)
-            )
-            steps.put(fresh, again)
+            nowhere = np.ones(len(fresh), dtype=bool)
+            again, found[fresh], _, direct[fresh] = self._straight(arms, which[fresh], targets[fresh], nowhere)
+            made.put(fresh, again)
         arms.next_vertex[which[direct]] = -1
-        done = direct | self._hesitate(arms, which, targets, valid & ~direct, steps)
-        if not done.all():
-            rest = ~done
-            steps.put(rest, self._indirect(arms, which[rest], targets[rest], valid[rest], ends[rest]))
-        return steps
+        on = ~direct & ~self._hesitate(arms, which, targets, valid & ~direct, made)
+        arms.held[which[on & valid]], arms.held_q[which[on & valid]] = np.nan, np.nan
+        steps.put(rows, made)
+        ends[rows], routed[rows] = found, on
+        on &= arms.on_task[which]
+        if on.any():
+            chosen, goals = which[on], np.where(valid[:, None], targets, arms.held[which])
+            self.detours.set_goals(arms, chosen, goals[on], found[on])
+            arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[on]
+        return routed
 
     def _hesitate(self, arms: Arms, which: Array, targets: Array, turned: Mask, steps: Steps) -> Mask:
         """Which of the arms (A,) whose way has just `turned` into a detour (A,) wait instead of setting off on it.
@@ -174,30 +192,36 @@ class Pilot:
         arms.held[which], arms.held_q[which], arms.solvable[which] = found
         arms.closely[which], arms.searched[which], arms.sought[which] = ~closely, True, targets
 
-    def _indirect(self, arms: Arms, which: Array, targets: Array, valid: Mask, ends: Array) -> Steps:
-        """`steps` of arms that cannot go straight to their targets.
+    def _lead(
+        self,
+        arms: Arms,
+        which: Array,
+        targets: Array,
+        routed: Mask,
+        on_way: Mask,
+        briefly: Mask,
+        steps: Steps,
+        ends: Array,
+    ) -> Mask:
+        """Sets the steps of arms on routes: of those that have just been `routed`, or else taken back to their map.
 
-        Those of which the map has a configuration there, where `valid`, are on the way to it, others to where they
-        hold; `ends` are the configurations that they are on the way to.
+        Returns:
+            (A,) those that were `on_way` and have no way on.
         """
-        arms.held[which[valid]], arms.held_q[which[valid]] = np.nan, np.nan
-        goals = np.where(valid[:, None], targets, arms.held[which])
-        steps, left = Steps.none_yet(arms, which), np.ones(len(which), dtype=bool)
-        routed = (left & arms.on_task[which]).nonzero()[0]
-        if len(routed):
-            chosen = which[routed]
-            self.detours.set_goals(arms, chosen, goals[routed], ends[routed])
-            steps.q[routed], left[routed] = self.detours.follow(arms, chosen, np.ones(len(chosen), dtype=bool))
-            arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[routed]
-            found = ~left[routed]
-            self.detours.give_up_ended(arms, chosen[found], steps.q[routed[found]], targets[routed[found]])
-        for row in left.nonzero()[0].tolist():
+        left = (routed & ~arms.on_task[which]) | on_way
+        rows = (routed & arms.on_task[which] | on_way).nonzero()[0]
+        if len(rows):
+            chosen = which[rows]
+            steps.q[rows], left[rows] = self.detours.follow(arms, chosen, (briefly | routed)[rows])
+            found = rows[~left[rows] & routed[rows]]
+            self.detours.give_up_ended(arms, which[found], steps.q[found], targets[found])
+        for row in (left & routed).nonzero()[0].tolist():
             step = self._back(arms, int(which[row]), ends[row])
             if step is None:
                 steps.codes[row] = HOLDING
             else:
                 steps.q[row] = step
-        return steps
+        return left & on_way
 
     def _back(self, arms: Arms, arm: int, goal_q: Array) -> Array | None:
         """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near."""
