@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 
@@ -28,6 +30,24 @@ _HESITATION = 2
 _ON_MAP = 0.05
 
 
+class _Round(NamedTuple):
+    """A step of A arms while it is decided.
+
+    Attributes:
+        arms: All arms.
+        which: (A,) those that are given targets.
+        targets: (A, width) these.
+        steps: What they do next, set by and by.
+        ends: (A, n) configurations that they are on the way to, set by and by.
+    """
+
+    arms: Arms
+    which: Array
+    targets: Array
+    steps: Steps
+    ends: Array
+
+
 class Pilot:
     """Decides the next step of arms that are given targets. Works on arrays, as `Follower` does."""
 
@@ -46,11 +66,11 @@ class Pilot:
         arms.blind[which[blind]] -= 1
         wanted = self._search(arms, which, targets, arms.holds(which) & ~blind)
         steps, ends = Steps.none_yet(arms, which), np.full_like(arms.q[which], np.nan)
+        round_ = _Round(arms, which, targets, steps, ends)
         looks, on_way = ~blind & ~(wanted & on_route), blind | wanted & on_route
         # all routes at once; whose way has come to nothing looks for another
         while looks.any() or on_way.any():
-            routed = self._look(arms, which, targets, looks, steps, ends)
-            looks = self._lead(arms, which, targets, routed, on_way, wanted, steps, ends)
+            looks = self._lead(round_, self._look(round_, looks), on_way, wanted)
             on_way = np.zeros_like(on_way)
         return steps
 
@@ -75,16 +95,8 @@ class Pilot:
             self._hold(arms, which[search], targets[search])
         return wanted
 
-    def _look(self, arms: Arms, who: Array, targets: Array, looks: Mask, steps: Steps, ends: Array) -> Mask:
-        """Sets the steps of arms that look where they can go.
-
-        Args:
-            arms: All arms.
-            who: (A,) some of them, and
-            targets: (A, width) theirs.
-            looks: (A,) those that look.
-            steps: Their steps.
-            ends: (A, n) configurations that they are on the way to, which are set.
+    def _look(self, round_: _Round, looks: Mask) -> Mask:
+        """Sets the steps of arms (A,) that look where they can go.
 
         Returns:
             (A,) those that cannot go straight, but by a route.
@@ -92,7 +104,7 @@ class Pilot:
         routed, rows = np.zeros_like(looks), looks.nonzero()[0]
         if len(rows) == 0:
             return routed
-        which, targets = who[rows], targets[rows]
+        arms, which, targets = round_.arms, round_.which[rows], round_.targets[rows]
         lost = arms.holds(which) & ~arms.solvable[which]
         made, found, valid, direct = self._straight(arms, which, targets, lost)
         arms.searched[which] = False
@@ -107,8 +119,8 @@ class Pilot:
         arms.next_vertex[which[direct]] = -1
         on = ~direct & ~self._hesitate(arms, which, targets, valid & ~direct, made)
         arms.held[which[on & valid]], arms.held_q[which[on & valid]] = np.nan, np.nan
-        steps.put(rows, made)
-        ends[rows], routed[rows] = found, on
+        round_.steps.put(rows, made)
+        round_.ends[rows], routed[rows] = found, on
         on &= arms.on_task[which]
         if on.any():
             chosen, goals = which[on], np.where(valid[:, None], targets, arms.held[which])
@@ -192,22 +204,13 @@ class Pilot:
         arms.held[which], arms.held_q[which], arms.solvable[which] = found
         arms.closely[which], arms.searched[which], arms.sought[which] = ~closely, True, targets
 
-    def _lead(
-        self,
-        arms: Arms,
-        which: Array,
-        targets: Array,
-        routed: Mask,
-        on_way: Mask,
-        briefly: Mask,
-        steps: Steps,
-        ends: Array,
-    ) -> Mask:
+    def _lead(self, round_: _Round, routed: Mask, on_way: Mask, briefly: Mask) -> Mask:
         """Sets the steps of arms on routes: of those that have just been `routed`, or else taken back to their map.
 
         Returns:
             (A,) those that were `on_way` and have no way on.
         """
+        arms, which, targets, steps, ends = round_
         left = (routed & ~arms.on_task[which]) | on_way
         rows = (routed & arms.on_task[which] | on_way).nonzero()[0]
         if len(rows):
