@@ -9,6 +9,7 @@ seeds the roadmap with all its vertices. Of a large task graph, the best coarse 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -36,6 +37,8 @@ _COARSE = {2: 120, 3: 300}
 _TURNED, _FEWEST = 4, 8
 # of a task graph with more vertices, on which a trial would take long, the best coarse map is taken as it is
 _MOST_TRIED = 10_000
+# of a projection on the coarse graph: what takes longer is out of reach, or a bad posture
+_ITERATIONS = 8
 # vertices averaged over on it
 _NEIGHBOURS = 24
 # share of the candidates that are relaxed on it, and of those that are tried on the task graph itself
@@ -49,7 +52,7 @@ _STEEP = 6.0
 # an edge that is missing, broken, or steeper, counts as this many times the smallest median of slopes
 _MISSING = 40.0
 # edges less steep than this many times the median are hardly ever broken
-_SUSPECT = 2.0
+_SUSPECT = 3.0
 
 
 def check_candidates(candidates: int) -> None:
@@ -93,7 +96,7 @@ def find_seeds(
     coarse = _coarse(task, graph, math.ceil(_COARSE[task.dimension] / share))
     progress("choosing seeds", 0, 3)
     neighbours = _NEIGHBOURS if task.rotations is None else default_neighbours(task)
-    maps = _expansions(robot, task, coarse, paths, neighbours, tolerances)
+    maps = _expansions(robot, task, coarse, paths, neighbours, replace(tolerances, iterations=_ITERATIONS))
     progress("choosing seeds", 1, 3)
     best = _costs(robot, task, coarse, maps).argsort(stable=True)[: math.ceil(_RELAXED * len(paths))]
     relaxed = _relaxed(robot, task, coarse, maps[best.to(maps.device)], tolerances, _ROUNDS)

@@ -98,24 +98,24 @@ def _led_round(
     if not joint.revolute:
         return [q[None] for q in configurations]
     axis, origin = mount[2, :3], mount[3, :3]
-    paths: list[Tensor] = []
     angles = [2.0 * math.pi * k / _STATIONS for k in range(_STATIONS)]
     stations = torch.stack([_turned(task, points, axis, origin, angle) for angle in angles])
-    for rigid in (1.0, 0.0):
-        q = configurations
-        found: list[Tensor] = []
-        reached: list[Tensor] = []
-        for k in range(_STATIONS):
-            guess = q.clone()
-            if k:
-                guess[:, joint.dof] = wrap(guess[:, joint.dof] + rigid * 2.0 * math.pi / _STATIONS)
-            guess = guess.clamp(robot.lower, robot.upper)
-            solved, valid = project_columns(robot, task, stations[k].T.contiguous(), guess.T.contiguous(), tolerances)
-            q = torch.where(valid[:, None], solved.T, guess)
-            found.append(q)
-            reached.append(valid)
-        rings, there = torch.stack(found, dim=1), torch.stack(reached, dim=1)
-        paths.extend(ring[mask] for ring, mask in zip(rings, there, strict=True) if int(mask.sum()) > _STATIONS // 2)
+    stations = torch.cat([stations, stations], dim=1)
+    turn = torch.tensor([2.0 * math.pi / _STATIONS, 0.0]).to(configurations).repeat_interleave(len(configurations))
+    q = torch.cat([configurations, configurations])
+    found: list[Tensor] = []
+    reached: list[Tensor] = []
+    for k, station in enumerate(stations):
+        guess = q.clone()
+        if k:
+            guess[:, joint.dof] = wrap(guess[:, joint.dof] + turn)
+        guess = guess.clamp(robot.lower, robot.upper)
+        solved, valid = project_columns(robot, task, station.T.contiguous(), guess.T.contiguous(), tolerances)
+        q = torch.where(valid[:, None], solved.T, guess)
+        found.append(q)
+        reached.append(valid)
+    rings, there = torch.stack(found, dim=1), torch.stack(reached, dim=1)
+    paths = [ring[mask] for ring, mask in zip(rings, there, strict=True) if int(mask.sum()) > _STATIONS // 2]
     return paths or [q[None] for q in configurations]
 
 
