@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -93,7 +94,7 @@ def join_bounds(arguments: list[str]) -> list[str]:
         position += 1
         if joined[-1] in _OF_NUMBERS:
             numbers: list[str] = []
-            while position < len(arguments) and _is_number(arguments[position]):
+            while position < len(arguments) and _is_value(arguments[position]):
                 numbers.append(arguments[position])
                 position += 1
             if numbers:
@@ -101,11 +102,12 @@ def join_bounds(arguments: list[str]) -> list[str]:
     return joined
 
 
-def _is_number(text: str) -> bool:
+def _is_value(text: str) -> bool:
+    """Whether a word is a number, or a wrong one: neither an option nor a file."""
     try:
         float(text)
     except ValueError:
-        return False
+        return text.isalnum() and not Path(text).exists()
     return True
 
 

@@ -147,6 +147,8 @@ def bad_files(folder):
         ("solve r.grr", "--point and --points: got neither"),
         ("solve r.grr --point 0 0 --points good.csv", "--point and --points: got both"),
         ("solve r.grr --point 0 0 0", "--point: got '0 0 0'; valid: 2 finite numbers: x y"),
+        ("solve r.grr --point a b", "--point: got 'a b'; valid: 2 finite numbers: x y"),
+        ("solve --point 0 b r.grr", "--point: got '0 b'; valid: 2 finite numbers: x y"),
         ("solve r.grr --point 0 nan", "2 finite numbers: x y"),
         ("solve none.grr --point 0 0", "none.grr: is not a file"),
         ("solve good.csv --point 0 0", "truncated or not a roadmap"),

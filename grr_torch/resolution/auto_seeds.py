@@ -96,7 +96,8 @@ def find_seeds(
     coarse = _coarse(task, graph, math.ceil(_COARSE[task.dimension] / share))
     progress("choosing seeds", 0, 3)
     neighbours = _NEIGHBOURS if task.rotations is None else default_neighbours(task)
-    maps = _expansions(robot, task, coarse, paths, neighbours, replace(tolerances, iterations=_ITERATIONS))
+    quick = replace(tolerances, iterations=min(tolerances.iterations, _ITERATIONS))
+    maps = _expansions(robot, task, coarse, paths, neighbours, quick)
     progress("choosing seeds", 1, 3)
     best = _costs(robot, task, coarse, maps).argsort(stable=True)[: math.ceil(_RELAXED * len(paths))]
     relaxed = _relaxed(robot, task, coarse, maps[best.to(maps.device)], tolerances, _ROUNDS)
