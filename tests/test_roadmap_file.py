@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 
 import numpy as np
 import pytest
@@ -12,8 +11,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import grr_torch
-from grr_torch.errors import FileFormatError, GrrError, OutputError
-from grr_torch.output import atomic_write
+from grr_torch.errors import FileFormatError
 from grr_torch.resolution.verify import verify_file
 from grr_torch.robots.urdf_json import urdf_from_json, urdf_to_json
 from grr_torch.tensor_file import read_tensors, tensor_hash, write_tensors
@@ -249,19 +247,6 @@ def test_what_is_written_is_what_the_library_reads(tmp_path, generator, shape, d
     assert tensor_hash(tensors["turned"]) == tensor_hash(again["turned"])
 
 
-def test_a_full_disk_is_a_clear_error_and_leaves_the_old_file(planar_roadmap, saved):
-    before = saved.read_bytes()
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limit[1]))
-    try:
-        with pytest.raises(OutputError, match=f"cannot write {saved}: "):
-            planar_roadmap.save(saved)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    assert saved.read_bytes() == before
-    assert list(saved.parent.iterdir()) == [saved]
-
-
 def test_a_missing_file_is_a_clear_error(tmp_path):
     with pytest.raises(FileFormatError, match="is not a file"):
         grr_torch.Roadmap.load(tmp_path / "none.grr")
@@ -275,31 +260,3 @@ def test_networkx_gets_the_resolved_part(planar_roadmap):
     np.testing.assert_array_equal(graph.nodes[node]["configuration"], planar_roadmap.configurations[node].numpy())
     slopes = [data["configuration_distance"] / data["point_distance"] for *_, data in graph.edges(data=True)]
     assert np.mean(slopes) == pytest.approx(planar_roadmap.quality().smoothness)
-
-
-def interrupt(temporary, error):
-    temporary.write_text("half")
-    raise error
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path):
-    path = tmp_path / "f.txt"
-    path.write_text("old")
-    with pytest.raises(RuntimeError), atomic_write(path) as temporary:
-        interrupt(temporary, RuntimeError())
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_an_interrupted_write_leaves_nothing(tmp_path):
-    with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "f.txt") as temporary:
-        interrupt(temporary, KeyboardInterrupt())
-    assert not list(tmp_path.iterdir())
-
-
-def test_an_unwritable_output_is_a_clear_error(planar_roadmap, tmp_path):
-    with pytest.raises(OutputError, match="does not exist"):
-        planar_roadmap.save(tmp_path / "none" / "f.grr")
-    with pytest.raises(OutputError, match="it is a folder"):
-        planar_roadmap.save(tmp_path)
-    assert issubclass(OutputError, GrrError)
