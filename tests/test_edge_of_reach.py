@@ -63,6 +63,18 @@ def test_arms_come_to_rest_where_they_are_stretched(roadmap):
     assert int(turned.sum(0).max()) <= 2
 
 
+def test_an_arm_that_has_come_to_where_it_holds_stays_there(planar_5):
+    """Nearly straight, it once went to and fro between two configurations at one point."""
+    roadmap = grr_torch.build(planar_5, "fixed-rotation")
+    start = torch.tensor([[-0.09705290, 0.04768368, 0.18119053, 0.03674411, -0.16856542]], dtype=torch.float64)
+    near = torch.tensor([[0.499760894, 0.014794328]], dtype=torch.float64)
+    out = torch.tensor([[0.501085176, 0.014576236]], dtype=torch.float64)
+    assert not bool(roadmap.solve(out).valid)
+    q, _ = follow_targets(Teleoperator(roadmap, max_step=0.05, start=start), torch.stack([near, *[out] * 200]))
+    steps = q[-100:].diff(dim=0)
+    assert not ((steps[1:] * steps[:-1]).sum(2) < -1e-6).any()
+
+
 def _unreachable(roadmap, count, seed):
     """Points (count, 3) a little beyond the edge of reach, and configurations of arms that hold there."""
     vertices = some_vertices(roadmap, count, seed)

@@ -117,6 +117,16 @@ def test_acceleration_limits_hold_and_arms_still_arrive(roadmap):
     assert float((apart < 1e-2).double().mean()) >= 0.8
 
 
+def test_with_acceleration_limits_a_joint_that_need_not_move_keeps_no_other(kinova):
+    """The last joint does not move the tool, so it stands where it is to stop."""
+    roadmap = grr_torch.build(kinova, "position", points=1200, refine=False)
+    vertices = some_vertices(roadmap, 20, 5)
+    start, goals = roadmap.configurations[vertices[:10]], roadmap.points[vertices[10:]]
+    q, _ = follow_targets(Teleoperator(roadmap, start=start, acceleration_limits=4.0), goals.expand(400, -1, -1))
+    apart = (roadmap.robot.forward_kinematics(q[-1])[0] - goals).norm(dim=1)
+    assert float((apart < 1e-2).double().mean()) >= 0.8
+
+
 def test_many_arms_are_the_same_as_one_at_a_time(roadmap):
     vertices = some_vertices(roadmap, 6, 13)
     targets = _hostile(roadmap, 6, 40, 4)

@@ -9,6 +9,8 @@ from grr_torch.applications.lines import SUBSTEPS, Follower
 from grr_torch.applications.rejoin import clearance
 from grr_torch.spaces.configuration import difference
 
+# a joint that is to move less [rad or m] is at rest
+_AT_REST = 1e-9
 # of the samples of one step, so many times are looked at on the way to a standstill
 _STEPS_CHECKED = 4
 
@@ -34,7 +36,8 @@ def limit_acceleration(
     left = difference(q, goals, follower.robot.continuous).abs()
     # the sum of v, v − a, v − 2a … must not exceed what is left
     fastest = (0.25 * gain**2 + 2.0 * gain * left).sqrt() - 0.5 * gain
-    share = (fastest / motion.abs().clamp_min(1e-12)).nan_to_num(nan=1.0).amin(1).clamp_max(1.0)
+    # joints that are where they are to stop, but for rounding, do not keep the others
+    share = torch.where(motion.abs() > _AT_REST, fastest / motion.abs(), 1.0).nan_to_num(nan=1.0).amin(1).clamp_max(1.0)
     change = share[:, None] * motion - speed
     moved = speed + change * (gain / change.abs().clamp_min(1e-12)).amin(1).clamp_max(1.0)[:, None]
     moved = torch.maximum(torch.minimum(moved, follower.longest), -follower.longest)

@@ -155,8 +155,9 @@ class Pilot:
             points = torch.from_numpy(targets[rows].astype(np.float64))
             guesses, codes = (part.numpy() for part in self.solver.guess(points, certified=False))
             ends[rows], known[rows] = guesses, codes <= 1
-        valid, direct = np.zeros_like(lost), np.zeros_like(lost)
-        rows = known.nonzero()[0]
+        valid, direct = np.zeros_like(lost), self._rests(arms, which, lost)
+        steps.points[direct], steps.codes[direct] = arms.p[which[direct]], UNREACHABLE
+        rows = (known & ~direct).nonzero()[0]
         if len(rows):
             chosen, lost = which[rows], lost[rows]
             goals = np.where(lost[:, None], arms.held[chosen], targets[rows])
@@ -168,6 +169,14 @@ class Pilot:
             steps.points[rows[free]] = lines.points[free]
             steps.codes[rows[free]] = np.where(lost, UNREACHABLE, TRACKING)[free]
         return steps, ends, valid, direct
+
+    def _rests(self, arms: Arms, which: Array, lost: Mask) -> Mask:
+        """Which of the arms (A,) that are `lost` (A,) stand where they hold, and stay.
+
+        Whatever the map's configuration there is now: near full stretch many are within the tolerance.
+        """
+        there = norms(arms.held[which] - arms.p[which]) <= self.follower.tolerances.position
+        return lost & there & arms.on_map[which] & arms.on_task[which]
 
     def _lines(self, arms: Arms, which: Array, goals: Array, guesses: Array, lost: Mask) -> tuple[Lines, Mask]:
         """Lines to goals (A, width), and which of these the map has a configuration for (A,), by its guesses (A, n).
