@@ -8,6 +8,8 @@ from teleoperated import follow_targets, some_vertices
 
 import grr_torch
 from grr_torch import Teleoperator
+from grr_torch.experiments.paths import draw_paths
+from grr_torch.experiments.teleoperation import starts
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +47,37 @@ def test_sliding_along_the_edge_of_reach_is_even(roadmap):
     assert float(sliding.double().mean()) > 0.9
     lengths, changes = steps.norm(dim=2), steps.diff(dim=0).norm(dim=2)
     assert float(changes.mean()) < 0.5 * float(lengths.mean())
+
+
+@pytest.fixture(scope="module")
+def on_circles(roadmap):
+    """Targets (200, 50, 3) on circles that leave the reach, tools there and before, and what the arms were doing."""
+    paths = draw_paths(roadmap, "circle_out", 50, seed=0)
+    start = starts(roadmap, paths[:, 0])
+    targets = paths.transpose(0, 1)
+    q, status = follow_targets(Teleoperator(roadmap, start=start, max_step=0.04), targets)
+    tools = roadmap.robot.forward_kinematics(torch.cat([start[None], q]))[0]
+    return targets, tools, status
+
+
+def test_an_arm_that_loses_its_target_holds_from_where_it_is(on_circles):
+    targets, tools, status = on_circles
+    lost = torch.from_numpy((status[1:] == "unreachable") & (status[:-1] == "tracking"))
+    assert int(lost.sum()) > 40
+    before, after = (part[lost] for part in (tools[1:-1], tools[2:]))
+    retreated = (after - targets[1:][lost]).norm(dim=1) - (before - targets[1:][lost]).norm(dim=1)
+    assert float((retreated > 1e-3).double().mean()) < 0.05
+
+
+def test_an_arm_does_not_turn_round_for_a_target_next_to_it(roadmap):
+    paths = draw_paths(roadmap, "line_random", 100, seed=0)
+    start = starts(roadmap, paths[:, 0])
+    targets = paths.transpose(0, 1)
+    q, status = follow_targets(Teleoperator(roadmap, start=start, max_step=0.04), targets)
+    tools = roadmap.robot.forward_kinematics(torch.cat([start[None], q]))[0]
+    turned = torch.from_numpy((status[1:] == "detouring") & (status[:-1] == "tracking"))
+    near = (tools[1:-1] - targets[1:]).norm(dim=2) < 0.02
+    assert not (turned & near).any()
 
 
 def test_arms_come_to_rest_where_they_are_stretched(roadmap):

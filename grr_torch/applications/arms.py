@@ -23,7 +23,6 @@ class Arms:
         speed: (B, n) what they moved in the last step, where accelerations are limited.
         p: (B, width) where their tools are.
         on_task: (B,) arms that meet their task's rotation and the joint limits and are free of self-collision.
-        on_map: (B,) arms that have gone straight to a target, wherefore their configurations are the map's.
         held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
         held_q: (B, n) configurations there.
         due: (B,) steps in which an arm is to be there.
@@ -49,7 +48,6 @@ class Arms:
     speed: Array
     p: Array
     on_task: Mask
-    on_map: Mask
     held: Array
     held_q: Array
     due: Array
@@ -84,7 +82,6 @@ class Arms:
             speed=np.zeros_like(q),
             p=unknown(width),
             on_task=np.zeros(count, dtype=bool),
-            on_map=np.zeros(count, dtype=bool),
             held=unknown(width),
             held_q=unknown(n),
             due=np.ones(count, dtype=np.int64),

@@ -109,7 +109,6 @@ class Pilot:
         made, found, valid, direct = self._straight(arms, which, targets, lost)
         arms.searched[which] = False
         arms.forget(which[direct & ~lost])
-        arms.on_map[which[direct & ~lost]] = True
         fresh = (~valid & ~lost).nonzero()[0]
         if len(fresh):
             self._hold(arms, which[fresh], targets[fresh])
@@ -176,7 +175,8 @@ class Pilot:
         Whatever the map's configuration there is now: near full stretch many are within the tolerance.
         """
         there = norms(arms.held[which] - arms.p[which]) <= self.follower.tolerances.position
-        return lost & there & arms.on_map[which] & arms.on_task[which]
+        there &= self.follower.distance(arms.q[which], arms.held_q[which]) <= _NEAR
+        return lost & there & arms.on_task[which]
 
     def _lines(self, arms: Arms, which: Array, goals: Array, guesses: Array, lost: Mask) -> tuple[Lines, Mask]:
         """Lines to goals (A, width), and which of these the map has a configuration for (A,), by its guesses (A, n).
@@ -205,7 +205,7 @@ class Pilot:
         unset = ~arms.holds(which)
         base = np.where(unset[:, None], arms.p[which], arms.held[which])
         # what is not to be gone to by any route must not be where a jump leads
-        here = unset & (arms.on_map[which] | arms.barred_from(which, targets, SAME_GOAL))
+        here = unset & arms.barred_from(which, targets, SAME_GOAL)
         base_q = np.where(here[:, None], arms.q[which], arms.held_q[which])
         closely = arms.closely[which] & ~unset
         found = nearest_feasible(self.follower, self.solver, base, base_q, targets, closely)
