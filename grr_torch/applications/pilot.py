@@ -197,7 +197,7 @@ class Pilot:
         if far.any():
             both = (torch.from_numpy(part[far]) for part in (lines.ends, guesses))
             found[far] = self.solver.on_map(*both).numpy()
-        arms.offsets[which[~lost]] = np.where(found[:, None], offsets, 0.0)[~lost]
+        arms.offsets[which] = np.where(found[:, None], offsets, 0.0)
         return lines, found
 
     def _hold(self, arms: Arms, which: Array, targets: Array) -> None:
