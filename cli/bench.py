@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from grr_torch.cli.bench_cluster import cluster
+from grr_torch.cli.bench_devices import devices
 from grr_torch.cli.bench_effort import effort
 from grr_torch.cli.bench_learning import learning
 from grr_torch.cli.bench_rotations import rotations
@@ -29,6 +30,7 @@ app.command()(learning)
 app.command()(rotations)
 app.command()(scale)
 app.command()(cluster)
+app.command()(devices)
 
 
 @app.callback()

@@ -28,6 +28,7 @@ def export(
     validation: Annotated[float, typer.Option(help="Share for validation.")] = 0.1,
     test: Annotated[float, typer.Option(help="Share for the test.")] = 0.1,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
 ) -> None:
     """Export a roadmap as a data set: points, configurations, validity, split.
@@ -47,7 +48,7 @@ def export(
     if out.resolve() == file.resolve():
         raise ParameterError("--out", out, "another file than the one that is read")
     check_dataset_path("--out", out)
-    roadmap = Roadmap.load(file)
+    roadmap = Roadmap.load(file, device=device)
     with progress_bar() as progress:
         counts = export_dataset(roadmap, out, samples, split=parts, jacobians=jacobians, seed=seed, progress=progress)
     if as_json:

@@ -35,6 +35,13 @@ def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
         except GrrError as error:
             typer.secho(f"error: {error}", err=True, fg=typer.colors.RED)
             raise typer.Exit(2) from error
+        except RuntimeError as error:
+            # torch's: it is not imported here, where it may not be needed
+            if type(error).__name__ != "OutOfMemoryError":
+                raise
+            given = str(error).splitlines()[0]
+            typer.secho(f"error: the device's memory is full: {given}", err=True, fg=typer.colors.RED)
+            raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
             typer.echo("interrupted: nothing was written", err=True)
             raise typer.Exit(130) from error

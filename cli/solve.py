@@ -37,6 +37,7 @@ def solve(
         Path | None,
         typer.Option(help="Write points, joints, valid and status here: .csv, .npy, .npz or .parquet."),
     ] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
 ) -> None:
     """Solve inverse kinematics on a roadmap: one configuration for any point of the task space.
@@ -63,7 +64,7 @@ def solve(
         if out.resolve() in {path.resolve() for path in (file, points) if path is not None}:
             raise ParameterError("--out", out, "another file than those that are read")
         check_writable(out)
-    roadmap = Roadmap.load(file)
+    roadmap = Roadmap.load(file, device=device)
     width, axes = roadmap.task.width, roadmap.task.coordinates
     places = np.array([numbers("--point", text, axes) for text in point or []]).reshape(-1, width)
     counts = {}

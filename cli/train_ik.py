@@ -31,6 +31,7 @@ def train_ik(
         float | None, typer.Option(help="Edge of the held-out blocks in metres; by default the map's edges'.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the state kept beside --out.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
 ) -> None:
@@ -64,7 +65,7 @@ def train_ik(
     if out.resolve() == file.resolve():
         raise ParameterError("--out", out, "another file than the one that is read")
     check_weights_path("--out", out)
-    roadmap = Roadmap.load(file)
+    roadmap = Roadmap.load(file, device=device)
     try:
         with progress_bar() as progress:
             ik = train(roadmap, options, out=out, resume=resume, on_epoch=_show_epoch, progress=progress)

@@ -18,6 +18,8 @@ Mask: TypeAlias = NDArray[np.bool_]
 # configurations worked on together: few enough for the cache, enough that a torch call costs less than its arithmetic
 _ON_CPU = 6000
 _ON_GPU = 1 << 18
+# so many times as much work keeps a GPU's processors busy as the CPU's
+_TIMES_ON_GPU = 16
 # up to so many, on the CPU, the number of calls is the cost, not the arithmetic
 FEW = 300
 
@@ -25,6 +27,11 @@ FEW = 300
 def piece(device: torch.device) -> int:
     """How many columns are worked on together."""
     return _ON_CPU if device.type == "cpu" else _ON_GPU
+
+
+def together(count: int, device: torch.device) -> int:
+    """How much is worked on together where the CPU works on `count`."""
+    return count if device.type == "cpu" else _TIMES_ON_GPU * count
 
 
 def slices(count: int, device: torch.device) -> list[slice]:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 import grr_torch
+from grr_torch.learning.dataset import RoadmapDataset
+from grr_torch.learning.export import export_dataset
+from grr_torch.learning.neural_ik import NeuralIK
+from grr_torch.learning.options import TrainingOptions
+from grr_torch.learning.train import train_ik
+from grr_torch.spaces.configuration import difference
 from grr_torch.spaces.task import FixedRotation
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device is available")
@@ -52,3 +59,88 @@ def test_roadmaps_are_as_good(robot, task):
     assert found.connected_edges == pytest.approx(expected.connected_edges, rel=0.005)
     assert found.smoothness == pytest.approx(expected.smoothness, rel=0.01)
     assert found.self_collisions in (None, 0)
+
+
+@pytest.mark.parametrize(
+    ("robot", "task", "size"),
+    [("planar_5", "pose", {"points": 300, "rotations": 6}), ("kinova", "yaw", {"points": 500, "rotations": 6})],
+)
+def test_roadmaps_of_turning_tools_are_as_good(robot, task, size):
+    expected, found = (
+        grr_torch.build(grr_torch.load_robot(robot, device=device), task, **size).quality()
+        for device in ("cpu", "cuda")
+    )
+    assert found.resolved_vertices == pytest.approx(expected.resolved_vertices, rel=0.01)
+    assert found.connected_edges == pytest.approx(expected.connected_edges, rel=0.01)
+    assert found.smoothness == pytest.approx(expected.smoothness, rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cuda") / "planar.grr"
+    grr_torch.build(grr_torch.load_robot("planar_5"), "position", points=300).save(path)
+    return path
+
+
+@pytest.mark.parametrize("count", [1, 500, 5000])
+def test_points_are_solved_alike(file, generator, count):
+    cpu, cuda = (grr_torch.Roadmap.load(file, device=device) for device in ("cpu", "cuda"))
+    points = cpu.points.amax(0) * (2.2 * torch.rand(count, 2, dtype=torch.float64, generator=generator) - 1.1)
+    expected, found = cpu.solve(points), cuda.solve(points.cuda())
+    assert found.configurations.device.type == found.valid.device.type == "cuda"
+    assert (found.status == expected.status).mean() > 0.99
+    both = expected.valid & found.valid.cpu()
+    torch.testing.assert_close(
+        found.configurations.cpu()[both], expected.configurations[both], atol=1e-6, rtol=0, check_device=False
+    )
+    assert bool(found.configurations[~found.valid].isnan().all())
+
+
+def test_training_ends_as_well_and_its_file_is_read_anywhere(file, tmp_path, generator):
+    cpu, cuda = (grr_torch.Roadmap.load(file, device=device) for device in ("cpu", "cuda"))
+    options = TrainingOptions(samples=5000, epochs=6, batch=256)
+    expected, found = train_ik(cpu, options), train_ik(cuda, options, out=tmp_path / "ik.safetensors")
+    assert found.network.last.weight.device.type == "cuda"
+    assert found.origin.training["validation"] == pytest.approx(expected.origin.training["validation"], rel=0.5)
+    points = RoadmapDataset(cpu, 2000).points
+    again = NeuralIK.load(tmp_path / "ik.safetensors", cpu.robot)
+    apart = difference(found(points.cuda()).cpu(), again(points), cpu.robot.continuous).abs()
+    assert (apart < 1e-3).double().mean() > 0.99
+    _, valid = found.refine(points.cuda(), 3)
+    assert valid.device.type == "cuda"
+    assert (valid.cpu() == again.refine(points, 3)[1]).double().mean() > 0.99
+
+
+def test_training_is_taken_up_on_the_device(file, tmp_path):
+    cuda = grr_torch.Roadmap.load(file, device="cuda")
+    options = TrainingOptions(samples=2000, epochs=4, batch=256)
+
+    def stop(epoch):
+        if epoch.epoch == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_ik(cuda, options, out=tmp_path / "ik.safetensors", on_epoch=stop)
+    resumed = train_ik(cuda, options, out=tmp_path / "ik.safetensors", resume=True)
+    whole = train_ik(cuda, options)
+    assert resumed.origin.training["validation"] == pytest.approx(whole.origin.training["validation"], rel=0.2)
+
+
+def test_data_sets_are_alike(file, tmp_path):
+    tables = []
+    for device in ("cpu", "cuda"):
+        out = tmp_path / f"{device}.npz"
+        export_dataset(grr_torch.Roadmap.load(file, device=device), out, 2000, jacobians=True)
+        with np.load(out) as table:
+            tables.append({name: table[name] for name in ("points", "configurations", "valid", "jacobians")})
+    both = tables[0]["valid"] & tables[1]["valid"]
+    assert both.mean() > 0.99
+    for name in ("points", "configurations", "jacobians"):
+        np.testing.assert_allclose(tables[0][name][both], tables[1][name][both], atol=1e-6)
+
+
+def test_checkpoints_are_taken_up_on_the_device(tmp_path):
+    robot = grr_torch.load_robot("planar_5", device="cuda")
+    whole = grr_torch.build(robot, "position", points=300, checkpoint=tmp_path / "kept")
+    resumed = grr_torch.build(robot, "position", points=300, checkpoint=tmp_path / "kept", resume=True)
+    torch.testing.assert_close(resumed.configurations, whole.configurations, equal_nan=True, atol=0, rtol=0)

@@ -14,7 +14,7 @@ from torch.nn.functional import embedding_bag
 
 from grr_torch.applications.around import Around, AroundProduct
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import FEW, Array, one_thread
+from grr_torch.pieces import FEW, Array, one_thread, together
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
@@ -104,9 +104,10 @@ class Solver:
         q = columns.new_empty(count, self.robot.n)
         codes = torch.empty(count, dtype=torch.uint8)
         with one_thread():
-            for start in range(0, count, _AT_ONCE):
+            at_once = together(_AT_ONCE, columns.device)
+            for start in range(0, count, at_once):
                 progress("solving", start, count)
-                part = slice(start, start + _AT_ONCE)
+                part = slice(start, start + at_once)
                 solved, codes[part] = self.solve_columns(columns[:, part])
                 q[part] = solved.T
         progress("solving", count, count)

@@ -44,7 +44,7 @@ class IkLoss:
     def __init__(self, robot: Robot, task: TaskSpace, encoding: Encoding) -> None:
         self._tree = _float32(robot.tree)
         self._task, self._encoding = task, encoding
-        self._rotation = task.rotation.float()[..., None] if isinstance(task, FixedRotation) else None
+        self._rotation = task.rotation.to(self._tree.mounts[0])[..., None] if isinstance(task, FixedRotation) else None
 
     def __call__(self, encoded: Tensor, targets: Tensor, points: Tensor) -> Loss:
         """The loss of encoded configurations (N, width) against targets (N, width) and points (N, d) [m]."""
@@ -60,5 +60,5 @@ class IkLoss:
 
 
 def _float32(tree: KinematicTree) -> KinematicTree:
-    links = {name: (frame, pose.float().cpu()) for name, (frame, pose) in tree.links.items()}
-    return replace(tree, mounts=tuple(mount.float().cpu() for mount in tree.mounts), links=links)
+    links = {name: (frame, pose.float()) for name, (frame, pose) in tree.links.items()}
+    return replace(tree, mounts=tuple(mount.float() for mount in tree.mounts), links=links)

@@ -16,7 +16,7 @@ from grr_torch.errors import FileFormatError, GrrError, ParameterError
 from grr_torch.learning.network import Architecture, IkNetwork
 from grr_torch.learning.refine import newton_steps
 from grr_torch.output import atomic_write
-from grr_torch.pieces import one_thread
+from grr_torch.pieces import one_thread, together
 from grr_torch.projection.project import Tolerances, point_columns
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.roadmap_file import roadmap_hash
@@ -98,7 +98,8 @@ class NeuralIK:
     """A network that has learned a roadmap: from points straight to configurations.
 
     Attributes:
-        network: The network, float32: points (N, d) [m] to configurations (N, n) [rad or m]; encoding inside.
+        network: The network, float32, on the robot's device: points (N, d) [m] to configurations (N, n) [rad or m];
+            encoding inside.
         robot: The robot.
         task: The task space.
         origin: What it was made for and from.
@@ -113,7 +114,8 @@ class NeuralIK:
         if robot_hash(robot) != origin.robot_hash:
             given = f"weights for {origin.robot} with joints {', '.join(origin.joint_names)}"
             raise ParameterError("weights", given, f"weights for this {robot.name} with its base, tool and held joints")
-        self.network, self.robot, self.task, self.origin = network.eval(), robot, origin.task, origin
+        self.network, self.robot = network.eval().to(robot.device), robot
+        self.task, self.origin = origin.task, origin
 
     def __call__(self, points: Tensor) -> Tensor:
         """What the network makes of points (*batch, d) [m]: configurations (*batch, n) [rad or m], unchecked.
@@ -124,14 +126,15 @@ class NeuralIK:
         Raises:
             ParameterError: The width is not the task's, or a value is not finite.
         """
-        rows = point_columns(self.robot, self.task, points).T.cpu()
-        q = torch.empty(len(rows), self.robot.n, dtype=self.robot.dtype)
+        rows = point_columns(self.robot, self.task, points).T
+        q = rows.new_empty(len(rows), self.robot.n)
+        at_once = together(_AT_ONCE, rows.device)
         with torch.no_grad(), one_thread():
             # what is a piece here is read, computed and written while it is in the cache
-            for start in range(0, len(rows), _AT_ONCE):
-                part = slice(start, start + _AT_ONCE)
+            for start in range(0, len(rows), at_once):
+                part = slice(start, start + at_once)
                 q[part] = self.network(rows[part].to(torch.float32, memory_format=torch.contiguous_format))
-        return q.to(self.robot.device).reshape(*points.shape[:-1], self.robot.n)
+        return q.reshape(*points.shape[:-1], self.robot.n)
 
     def refine(self, points: Tensor, steps: int = 2) -> tuple[Tensor, Tensor]:
         """The network's configurations after a few Newton steps towards the points.
@@ -176,7 +179,7 @@ class NeuralIK:
 
 def save_network(path: str | os.PathLike[str], network: IkNetwork, origin: Origin) -> None:
     """Writes a network and where it comes from; see `NeuralIK.save`."""
-    tensors = {name: tensor.detach().contiguous() for name, tensor in network.state_dict().items()}
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
     metadata = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,

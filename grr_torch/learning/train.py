@@ -15,7 +15,7 @@ from torch import Tensor
 from grr_torch.errors import ParameterError, TrainingError
 from grr_torch.learning.checkpoint import Checkpoint, checkpoint_path
 from grr_torch.learning.dataset import RoadmapDataset
-from grr_torch.learning.loss import IkLoss
+from grr_torch.learning.loss import IkLoss, Loss
 from grr_torch.learning.network import IkNetwork
 from grr_torch.learning.neural_ik import NeuralIK, Origin
 from grr_torch.learning.options import Epoch, TrainingOptions
@@ -49,8 +49,9 @@ def train_ik(
     """Trains a network to give the configurations of a roadmap.
 
     The loss is chordal in joint space, and the tool's distance and rotation through differentiable forward kinematics.
-    What is kept is the network of the epoch with the least loss on the validation part. Training runs on one thread
-    and is repeatable: the same options give the same network on the same machine, taken up again or not.
+    What is kept is the network of the epoch with the least loss on the validation part. Training runs on the device of
+    the roadmap's robot, of the CPU on one thread, and is repeatable there: the same options give the same network on
+    the same machine, taken up again or not.
 
     Args:
         roadmap: The roadmap.
@@ -112,8 +113,9 @@ class _Training:
     def __init__(
         self, roadmap: Roadmap, options: TrainingOptions, dataset: RoadmapDataset, checkpoint: Checkpoint | None
     ) -> None:
-        self.options, self.dataset, self.checkpoint = options, dataset, checkpoint
-        self.parts = {part: dataset.indices(part) for part in ("train", "validation")}
+        device = roadmap.robot.device
+        self.options, self.checkpoint = options, checkpoint
+        self.parts = {part: dataset.indices(part).to(device) for part in ("train", "validation")}
         for part, rows in self.parts.items():
             if len(rows) == 0:
                 given = f"{len(dataset)} samples of which none is for {part}"
@@ -123,8 +125,10 @@ class _Training:
         self.network = IkNetwork(roadmap.robot.continuous.tolist(), roadmap.task.width, options.architecture)
         torch.random.set_rng_state(state)
         self.network.encoding.load_state_dict(dataset.encoding.state_dict())
+        self.network.to(device)
         self.loss = IkLoss(roadmap.robot, roadmap.task, self.network.encoding)
-        self.points = dataset.points.float()
+        self.inputs, self.targets = dataset.inputs.to(device), dataset.targets.to(device)
+        self.points = dataset.points.float().to(device)
         self.scale = float(dataset.encoding.scale)
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=options.learning_rate, betas=(0.9, 0.99))
         self.steps = -(-len(self.parts["train"]) // options.batch)
@@ -203,9 +207,12 @@ class _Training:
         share = (done - _POSE_BEGINS) / (_POSE_WHOLE - _POSE_BEGINS)
         return self.options.pose_weight * min(1.0, max(0.0, share))
 
+    def _loss(self, batch: Tensor) -> Loss:
+        inputs, targets, points = self.inputs[batch], self.targets[batch], self.points[batch]
+        return self.loss(self.network.encoded(inputs), targets, points)
+
     def _losses(self, batch: Tensor, pose_weight: float) -> Tensor:
-        inputs, targets = self.dataset[batch]
-        loss = self.loss(self.network.encoded(inputs), targets, self.points[batch])
+        loss = self._loss(batch)
         pose = pose_weight * loss.pose(self.scale)
         # at weight 0 targets may be anything, NaN too
         return pose if self.options.joint_weight == 0.0 else pose + self.options.joint_weight * loss.joints
@@ -213,11 +220,10 @@ class _Training:
     def _validate(self) -> dict[str, float]:
         """Loss, millimetres and degrees on the validation part."""
         rows = self.parts["validation"]
-        sums = torch.zeros(3, dtype=torch.float64)
+        sums = torch.zeros(3, dtype=torch.float64, device=self.points.device)
         with torch.no_grad():
             for batch in rows.split(self.options.batch):
-                inputs, targets = self.dataset[batch]
-                loss = self.loss(self.network.encoded(inputs), targets, self.points[batch])
+                loss = self._loss(batch)
                 whole = self.options.pose_weight * loss.pose(self.scale)
                 if self.options.joint_weight > 0.0:
                     whole = whole + self.options.joint_weight * loss.joints
@@ -232,9 +238,10 @@ class _Training:
     def _state(self) -> dict[str, Tensor]:
         """All tensors from which training goes on."""
         moments = self.optimiser.state_dict()["state"]
-        return {
+        tensors = {
             **{f"network.{name}": tensor for name, tensor in self._weights().items()},
             **{f"best.{name}": tensor for name, tensor in self.best_state.items()},
             **{f"first.{k}": moment["exp_avg"] for k, moment in moments.items()},
             **{f"second.{k}": moment["exp_avg_sq"] for k, moment in moments.items()},
         }
+        return {name: tensor.cpu() for name, tensor in tensors.items()}

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError, check_seed
+from grr_torch.pieces import together
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project_columns, tool_points
@@ -196,7 +197,8 @@ def _broken(
     """(C, E) edges of maps (C, V, n), with slopes (C, E), that are steep and not continuous."""
     broken = slopes > _SUSPECT * slopes.nanmedian(dim=1, keepdim=True).values
     points = graph.points.to(maps)
-    for which, edges in zip(*(part.split(EDGES_AT_ONCE) for part in broken.nonzero(as_tuple=True)), strict=True):
+    for part in broken.nonzero().split(together(EDGES_AT_ONCE, maps.device)):
+        which, edges = part.unbind(1)
         first, second = graph.edges.to(maps.device)[edges].unbind(1)
         ends = points[first], points[second], maps[which, first], maps[which, second]
         broken[which, edges] = ~is_continuous(robot, task, *ends, tolerances=tolerances)

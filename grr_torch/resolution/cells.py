@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from grr_torch.pieces import together
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
@@ -119,9 +120,10 @@ def spreads(
     done = int(state["done"]) if state else 0
     spread[:done] = state["spread"].to(spread) if state else spread[:0]
     pairs = torch.combinations(torch.arange(corners.shape[1], device=q.device))
-    for start in range(done, count, CELLS_AT_ONCE):
+    at_once = together(CELLS_AT_ONCE, q.device)
+    for start in range(done, count, at_once):
         progress("measuring cells", start, count)
-        part = corners[start : start + CELLS_AT_ONCE].to(q.device)
+        part = corners[start : start + at_once].to(q.device)
         ends, followed = lead_to_centres(robot, task, points[part], q[part], tolerances)
         apart = distance(ends[:, pairs[:, 0]], ends[:, pairs[:, 1]], robot.continuous).amax(1)
         end = start + len(part)

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import one_thread
+from grr_torch.pieces import one_thread, together
 from grr_torch.progress import Progress
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.cells import CELLS_AT_ONCE, LARGEST_SPREAD, lead_to_centres, spreads
@@ -152,7 +152,7 @@ def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> T
 def _spread(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances) -> tuple[Tensor, Tensor, Tensor]:
     """Spread of cells (C,), and of their three pairs of corners: (2, 3C) and what is between their ends (n, 3C)."""
     robot = network.robot
-    parts = [part.to(q.device) for part in corners.split(CELLS_AT_ONCE)]
+    parts = [part.to(q.device) for part in corners.split(together(CELLS_AT_ONCE, q.device))]
     ends, followed = zip(
         *(lead_to_centres(robot, network.task, network.targets.T[part], q.T[part], tolerances) for part in parts),
         strict=True,

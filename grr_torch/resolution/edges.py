@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from grr_torch.pieces import together
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances
@@ -73,7 +74,7 @@ def continuous_edges(
     state = kept.state()
     if state:
         connected = state["connected"].to(robot.device)
-    at_once = getattr(check, "at_once", EDGES_AT_ONCE)
+    at_once = getattr(check, "at_once", together(EDGES_AT_ONCE, robot.device))
     for start in range(int(state["done"]) if state else 0, len(candidates), at_once):
         progress("checking edges", start, len(candidates))
         part = candidates[start : start + at_once]

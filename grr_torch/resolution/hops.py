@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import in_pieces
+from grr_torch.pieces import in_pieces, together
 from grr_torch.projection.project import Tolerances, project_columns
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def hop(network: Network, q: Tensor, active: Tensor, tolerances: Tolerances) -> 
         return q
     gains = torch.zeros_like(q[0])
     better = q.clone()
-    for part in vertices.split(_TRIED_AT_ONCE):
+    for part in vertices.split(together(_TRIED_AT_ONCE, q.device)):
         candidates, gain = _best_candidates(network, q, part, tolerances)
         better[:, part], gains[part] = candidates, gain
     rank, places = network.incidence.around(vertices)

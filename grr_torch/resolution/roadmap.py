@@ -256,18 +256,24 @@ class Roadmap:
         save_roadmap(self, path)
 
     @staticmethod
-    def load(path: str | os.PathLike[str]) -> Roadmap:
+    def load(path: str | os.PathLike[str], *, device: torch.device | str | None = None) -> Roadmap:
         """Opens a `.grr` file; neither the URDF nor the meshes it was built from are needed.
 
         The tensors are mapped: of the file, only what is used is read. So what they hold is not checked;
         `grr-torch info FILE --verify` does that.
 
+        Args:
+            path: The file.
+            device: Where its robot computes, and what is solved comes out; the CPU by default. Its tables stay on the
+                CPU.
+
         Raises:
+            ParameterError: There is no such device.
             FileFormatError: It is missing, truncated, of another version, not a roadmap, or tensors do not fit.
         """
         from grr_torch.resolution.roadmap_file import load_roadmap
 
-        return load_roadmap(path)
+        return load_roadmap(path, device=device)
 
     def to_networkx(self) -> networkx.Graph[int]:
         """The roadmap as a networkx graph.

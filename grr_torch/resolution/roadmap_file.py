@@ -18,7 +18,7 @@ from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.quality import Quality
 from grr_torch.resolution.report import check_refinement
 from grr_torch.resolution.roadmap import Roadmap
-from grr_torch.robots.load import make_robot
+from grr_torch.robots.load import find_device, make_robot
 from grr_torch.robots.presets import load_preset, robot_names
 from grr_torch.robots.robot import Robot
 from grr_torch.robots.spheres import SphereModel
@@ -80,8 +80,11 @@ def solving_tables(roadmap: Roadmap) -> dict[str, Tensor]:
     return dict(zip(_TABLES, (*roadmap.neighbours, *roadmap.uncertified), strict=True))
 
 
-def load_roadmap(path: str | os.PathLike[str], robot: Robot | None = None) -> Roadmap:
+def load_roadmap(
+    path: str | os.PathLike[str], robot: Robot | None = None, *, device: torch.device | str | None = None
+) -> Roadmap:
     """Reads a roadmap; see `Roadmap.load`. A `robot` may be given in place of the file's, as which it was checked."""
+    on = find_device(device)
     metadata, tensors = read_file(path)
     _check_tensors(path, tensors)
     _check_indices(path, tensors)
@@ -92,7 +95,7 @@ def load_roadmap(path: str | os.PathLike[str], robot: Robot | None = None) -> Ro
         for name, hint in get_type_hints(Quality).items():
             if not isinstance(metadata["quality"][name], hint):
                 raise FileFormatError(path, f"has a quality figure '{name}' that is no such number")
-        robot = robot or _robot_from_json(metadata["robot"])
+        robot = robot or _robot_from_json(metadata["robot"], on)
         task = task_from_json(metadata["task"])
         parameters, seconds = dict(metadata["parameters"]), float(metadata["build_seconds"])
         longest = float(metadata["longest_edge"])
@@ -171,7 +174,7 @@ def robot_to_json(robot: Robot) -> dict[str, Any]:
     }
 
 
-def _robot_from_json(data: dict[str, Any]) -> Robot:
+def _robot_from_json(data: dict[str, Any], device: torch.device) -> Robot:
     directory = data["urdf_directory"]
     if data["bundled"] and data["name"] in robot_names():
         directory = load_preset(data["name"]).urdf.parent
@@ -190,7 +193,7 @@ def _robot_from_json(data: dict[str, Any]) -> Robot:
         held_joints=data["held_joints"],
         spheres=None if spheres is None else SphereModel.parse(spheres, urdf.links, source=data["name"]),
         margin=float(data["margin"]),
-        device=torch.device("cpu"),
+        device=device,
         dtype=torch.float32 if data["dtype"] == "float32" else torch.float64,
     )
 

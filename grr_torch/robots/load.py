@@ -76,7 +76,7 @@ def load_robot(
         held_joints=held_joints or {},
         spheres=spheres,
         margin=margin,
-        device=_device(device),
+        device=find_device(device),
         dtype=dtype,
     )
     return replace(robot, preset=preset)
@@ -127,7 +127,7 @@ def make_robot(
     ).with_margin(margin)
 
 
-def _device(device: torch.device | str | None) -> torch.device:
+def find_device(device: torch.device | str | None) -> torch.device:
     """The device, after a first tensor was put on it.
 
     Raises:

@@ -1,0 +1,62 @@
+"""`grr-torch bench devices`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+
+if TYPE_CHECKING:
+    from grr_torch.experiments.devices import Result
+
+
+@reports_errors
+def devices(
+    device: Annotated[
+        list[str] | None, typer.Option(help="cpu, cuda, cuda:0, …; repeatable; cpu and cuda by default.")
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="roadmaps, solve, export, train or large; repeatable; all by default.")
+    ] = None,
+    solves: Annotated[int, typer.Option(min=1, help="Points to solve.")] = 1_000_000,
+    samples: Annotated[int, typer.Option(min=1, help="Rows to export, and to train from.")] = 100_000,
+    epochs: Annotated[int, typer.Option(min=1, help="Epochs to train.")] = 3,
+    repeats: Annotated[int, typer.Option(min=1, help="Roadmaps and solving: medians of so many.")] = 3,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+) -> None:
+    """Print how long the same work takes on several devices, and what comes out, as a Markdown table.
+
+    The large build has a million vertices and takes minutes.
+
+    Example: grr-torch bench devices --only roadmaps --only solve
+    """
+    from grr_torch.experiments.devices import measure_devices
+    from grr_torch.experiments.timing import machine
+    from grr_torch.output import atomic_write, check_writable
+
+    if json_file is not None:
+        check_writable(json_file)
+    with progress_bar() as progress:
+        results = measure_devices(
+            device or ("cpu", "cuda"),
+            work=only,
+            solves=solves,
+            samples=samples,
+            epochs=epochs,
+            repeats=repeats,
+            progress=progress,
+        )
+    if json_file is not None:
+        with atomic_write(json_file) as path:
+            data = {"machine": machine(), "work": [result.to_dict() for result in results]}
+            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
+    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    typer.echo(markdown_table(["work", "device", "time [s]", "what comes out"], [_row(result) for result in results]))
+
+
+def _row(result: Result) -> list[str]:
+    outcome = ", ".join(f"{name} {value:,.6g}" for name, value in result.outcome.items())
+    return [result.work, result.device, f"{result.seconds:.3g}", outcome]
