@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -94,7 +94,7 @@ def join_bounds(arguments: list[str]) -> list[str]:
         position += 1
         if joined[-1] in _OF_NUMBERS:
             numbers: list[str] = []
-            while position < len(arguments) and _is_value(arguments[position]):
+            while position < len(arguments) and _is_value(arguments[position], numbers, arguments[position + 1 :]):
                 numbers.append(arguments[position])
                 position += 1
             if numbers:
@@ -102,12 +102,20 @@ def join_bounds(arguments: list[str]) -> list[str]:
     return joined
 
 
-def _is_value(text: str) -> bool:
-    """Whether a word is a number, or a wrong one: neither an option nor a file."""
+def _is_value(text: str, before: list[str], after: list[str]) -> bool:
+    """Whether a word is a number, or one that was to be: the error names it then.
+
+    What follows numbers, and is the last word or the last before an option, may be a file.
+    """
+    among = bool(after) and not after[0].startswith("--")
+    return _like_a_number(text) or (text.isalnum() and (among or not any(map(_like_a_number, before))))
+
+
+def _like_a_number(text: str) -> bool:
     try:
         float(text)
     except ValueError:
-        return text.isalnum() and not Path(text).exists()
+        return re.fullmatch(r"[+-]?\.?\d\S*", text) is not None
     return True
 
 

@@ -10,7 +10,7 @@ from grr_torch import Teleoperator
 
 
 def some_vertices(roadmap: grr_torch.Roadmap, count: int, seed: int = 0) -> torch.Tensor:
-    """Resolved vertices of one connected part."""
+    """Resolved vertices, drawn at random."""
     resolved = roadmap.resolved.nonzero()[:, 0]
     order = torch.randperm(len(resolved), generator=torch.Generator().manual_seed(seed))
     return resolved[order[:count]]

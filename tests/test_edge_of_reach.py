@@ -80,32 +80,85 @@ def test_an_arm_does_not_turn_round_for_a_target_next_to_it(roadmap):
     assert not (turned & near).any()
 
 
-def test_arms_come_to_rest_where_they_are_stretched(roadmap):
-    """There projections end here and there within the tolerance; no arm goes to and fro."""
+@pytest.fixture(scope="module")
+def stretched(roadmap):
+    """Points (150, 3) where the map's configurations are far from their guesses, arms near full stretch."""
     generator = torch.Generator().manual_seed(2)
     points = 2.0 * torch.rand(20_000, 3, dtype=torch.float64, generator=generator) - 1.0
     guesses, codes = roadmap.solver.guess(points, certified=False)
     solved = roadmap.solver.solve_columns(points.T.contiguous())[0].T
     off = grr_torch.spaces.configuration.distance(guesses, solved, roadmap.robot.continuous)
-    targets = points[(codes <= 1) & (off > 0.5)][:150]
-    assert len(targets) == 150
-    start = roadmap.configurations[roadmap.solver.nearest(targets)[1][:, 0]]
-    q, _ = follow_targets(Teleoperator(roadmap, start=start, max_step=0.04), targets.expand(260, -1, -1))
+    found = points[(codes <= 1) & (off > 0.5)][:150]
+    assert len(found) == 150
+    return found
+
+
+def _beside(roadmap, points):
+    """Arms at the vertices nearest to points."""
+    start = roadmap.configurations[roadmap.solver.nearest(points)[1][:, 0]]
+    return Teleoperator(roadmap, start=start, max_step=0.04)
+
+
+def test_arms_come_to_rest_where_they_are_stretched(roadmap, stretched):
+    """There projections end here and there within the tolerance; no arm goes to and fro."""
+    q, _ = follow_targets(_beside(roadmap, stretched), stretched.expand(260, -1, -1))
     steps = q[-60:].diff(dim=0)
     turned = (steps[1:] * steps[:-1]).sum(2) < -1e-6
     assert int(turned.sum(0).max()) <= 2
 
 
-def test_an_arm_that_has_come_to_where_it_holds_stays_there(planar_5):
-    """Nearly straight, it once went to and fro between two configurations at one point."""
-    roadmap = grr_torch.build(planar_5, "fixed-rotation")
-    start = torch.tensor([[-0.09705290, 0.04768368, 0.18119053, 0.03674411, -0.16856542]], dtype=torch.float64)
-    near = torch.tensor([[0.499760894, 0.014794328]], dtype=torch.float64)
-    out = torch.tensor([[0.501085176, 0.014576236]], dtype=torch.float64)
-    assert not bool(roadmap.solve(out).valid)
-    q, _ = follow_targets(Teleoperator(roadmap, max_step=0.05, start=start), torch.stack([near, *[out] * 200]))
-    steps = q[-100:].diff(dim=0)
-    assert not ((steps[1:] * steps[:-1]).sum(2) < -1e-6).any()
+@pytest.mark.parametrize("lost_before", [0, 100])
+def test_what_was_expected_of_another_target_is_forgotten(roadmap, stretched, lost_before):
+    """Stretched arms whose targets leap back, at once or after they were out of reach, go there as any arm would."""
+    teleoperator = _beside(roadmap, stretched)
+    follow_targets(teleoperator, stretched.expand(200, -1, -1))
+    out = 1.6 * stretched / stretched.norm(dim=1, keepdim=True)
+    for _ in range(lost_before):
+        teleoperator.step(out)
+    fresh = Teleoperator(roadmap, start=teleoperator.configuration, max_step=0.04)
+    command, expected = (arms.step(0.85 * stretched) for arms in (teleoperator, fresh))
+    assert (command.status == expected.status).all()
+    assert float((command.configuration - expected.configuration).abs().max()) < 2e-3
+
+
+def test_arms_that_are_pulled_out_of_reach_straighten_evenly_and_rest(roadmap, stretched):
+    """Their targets go slowly through where they are stretched to beyond, and stay there."""
+    share = torch.linspace(0.9, 1.1, 150, dtype=torch.float64)[:, None, None]
+    targets = torch.cat([share * stretched, (1.1 * stretched).expand(110, -1, -1)])
+    q, status = follow_targets(_beside(roadmap, targets[0]), targets)
+    assert (status[-60:] == "unreachable").mean() > 0.95
+    steps = q.diff(dim=0)
+    turned = (steps[1:] * steps[:-1]).sum(2) < -1e-6
+    assert float(turned.double().sum(0).mean()) < 0.7
+    assert float(steps.diff(dim=0).norm(dim=2).flatten().quantile(0.99)) < 0.016
+    assert float(steps[-60:].abs().max()) < 1e-3
+
+
+def test_many_arms_of_single_precision_hold_too():
+    robot = grr_torch.load_robot("planar_5", dtype=torch.float32)
+    roadmap = grr_torch.build(robot, "position", points=300)
+    points, start = _unreachable(roadmap, 100, 3)
+    q, status = follow_targets(Teleoperator(roadmap, start=start, max_step=0.1), points.expand(80, -1, -1))
+    assert q.dtype == torch.float32
+    assert (status[-10:] == "unreachable").all()
+    assert float(q[-10:].diff(dim=0).abs().max()) < 1e-3
+
+
+def test_arms_in_contact_do_not_wait_before_they_leave_it(roadmap):
+    """Others do, where a target next to the tool is reached by a detour only."""
+    q = roadmap.robot.sample(20_000, torch.Generator().manual_seed(3))
+    points = roadmap.robot.forward_kinematics(q)[0]
+    start, _ = grr_torch.project(roadmap.robot, roadmap.task, points, q, check_collision=False)
+    solvable = roadmap.solve(points).valid & start.isfinite().all(1)
+    touching = solvable & roadmap.robot.in_self_collision(start.nan_to_num())
+    start, points = start[touching][:60], points[touching][:60]
+    assert len(start) > 20
+    teleoperator = Teleoperator(roadmap, start=start, max_step=0.04)
+    waiting = torch.from_numpy(teleoperator.step(points).status == "holding")
+    for _ in range(3):
+        status = teleoperator.step(points).status
+    # who holds has found no way on, and still has none
+    assert (status[waiting.numpy()] == "holding").all()
 
 
 def _unreachable(roadmap, count, seed):

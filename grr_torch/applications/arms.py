@@ -25,7 +25,7 @@ class Arms:
         on_task: (B,) arms that meet their task's rotation and the joint limits and are free of self-collision.
         held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
         held_q: (B, n) configurations there.
-        due: (B,) steps in which an arm is to be there.
+        due: (B,) steps that are left in which an arm is to come there; at least 1.
         closely: (B,) whether it is next looked for closely round the last one.
         sought: (B, width) the target for which it was last looked for; NaN where there is none.
         searched: (B,) whether what was found then has not been acted on yet.
@@ -39,7 +39,8 @@ class Arms:
         aimed: (B, width) the target for which it does so; a target elsewhere is looked for at once.
         doubt: (B,) how many these are the next time.
         hesitated: (B,) steps for which an arm has waited before a detour since it last went straight.
-        offsets: (B, n) what the last end of a line differed from its guess by.
+        offsets: (B, n) what the end of the last line to a target differed from its guess by, and
+        offset_at: (B, width) the target; NaN where there was none.
         barred: (B, width) the last target that a route led near, without a way on from there; NaN where there is none.
         avoided: Of each arm, the edges that it could not follow since it last went straight.
     """
@@ -65,6 +66,7 @@ class Arms:
     doubt: Array
     hesitated: Array
     offsets: Array
+    offset_at: Array
     barred: Array
     avoided: list[frozenset[tuple[int, int]]]
 
@@ -99,6 +101,7 @@ class Arms:
             doubt=np.ones(count, dtype=np.int64),
             hesitated=np.zeros(count, dtype=np.int64),
             offsets=np.zeros_like(q),
+            offset_at=unknown(width),
             barred=unknown(width),
             avoided=[frozenset()] * count,
         )

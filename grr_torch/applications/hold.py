@@ -57,7 +57,8 @@ def nearest_feasible(
     Returns:
         Points (B, width), configurations (B, n), and which targets the map solves (B,).
     """
-    apart = np.minimum(norms(targets - base), _AROUND) * np.where(closely, _CLOSE, 1.0)
+    close = np.where(closely, _CLOSE, 1.0).astype(base.dtype)
+    apart = np.minimum(norms(targets - base), _AROUND) * close
     around = base[:, None] + apart[:, None, None] * _directions(targets - base)
     points = np.concatenate([base[:, None], around, targets[:, None]], axis=1)
     # as long as the arm can stay where it is, only what is nearer to the target can be better

@@ -120,7 +120,7 @@ class Follower:
             targets: (B, width) the ends.
             offsets: (B, n) what the ends are expected to differ from their guesses by, as they did in the last step:
                 lines lead there, so that steps are not short where guesses are far off. By default nothing.
-            pace: (B,) the most of a line that one step covers.
+            pace: (B,) the most of a line that one step covers, from above 0 to 1; the whole line by default.
         """
         motion = self.difference(q, guesses if offsets is None else guesses + offsets)
         aim = self._aim(q, motion, pace)
@@ -166,7 +166,7 @@ class Follower:
         return _Aim(q, near, length, short, fractions, looked)
 
     def share(self, motion: Array) -> Array:
-        """(B,) how much of motions (B, n) one step covers."""
+        """(B,) how much of motions (B, n) a step covers, a little less than it could; above 1 of short ones."""
         return _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
 
     def _judge(self, aim: _Aim, found: Array, reached: Mask, after: Array, p: Array, targets: Array) -> Lines:

@@ -67,7 +67,8 @@ class Pilot:
         wanted = self._search(arms, which, targets, arms.holds(which) & ~blind)
         steps, ends = Steps.none_yet(arms, which), np.full_like(arms.q[which], np.nan)
         round_ = _Round(arms, which, targets, steps, ends)
-        looks, on_way = ~blind & ~(wanted & on_route), blind | wanted & on_route
+        on_way = on_route & (blind | wanted)
+        looks = ~on_way
         # all routes at once; whose way has come to nothing looks for another
         while looks.any() or on_way.any():
             looks = self._lead(round_, self._look(round_, looks), on_way, wanted)
@@ -112,19 +113,19 @@ class Pilot:
         fresh = (~valid & ~lost).nonzero()[0]
         if len(fresh):
             self._hold(arms, which[fresh], targets[fresh])
-            nowhere = np.ones(len(fresh), dtype=bool)
-            again, found[fresh], _, direct[fresh] = self._straight(arms, which[fresh], targets[fresh], nowhere)
+            every = np.ones(len(fresh), dtype=bool)
+            again, found[fresh], _, direct[fresh] = self._straight(arms, which[fresh], targets[fresh], every)
             made.put(fresh, again)
         arms.next_vertex[which[direct]] = -1
-        on = ~direct & ~self._hesitate(arms, which, targets, valid & ~direct, made)
-        arms.held[which[on & valid]], arms.held_q[which[on & valid]] = np.nan, np.nan
+        away = ~direct & ~self._hesitate(arms, which, targets, valid & ~direct, made)
+        arms.held[which[away & valid]], arms.held_q[which[away & valid]] = np.nan, np.nan
         round_.steps.put(rows, made)
-        round_.ends[rows], routed[rows] = found, on
-        on &= arms.on_task[which]
-        if on.any():
-            chosen, goals = which[on], np.where(valid[:, None], targets, arms.held[which])
-            self.detours.set_goals(arms, chosen, goals[on], found[on])
-            arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[on]
+        round_.ends[rows], routed[rows] = found, away
+        away &= arms.on_task[which]
+        if away.any():
+            chosen, goals = which[away], np.where(valid[:, None], targets, arms.held[which])
+            self.detours.set_goals(arms, chosen, goals[away], found[away])
+            arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[away]
         return routed
 
     def _hesitate(self, arms: Arms, which: Array, targets: Array, turned: Mask, steps: Steps) -> Mask:
@@ -133,7 +134,7 @@ class Pilot:
         At the edge of a hole a target next to the tool often is one of a few steps that are on the other side of a
         self-motion, and the arm would turn round for them.
         """
-        near = norms(targets - arms.p[which]) <= SAME_GOAL
+        near = (norms(targets - arms.p[which]) <= SAME_GOAL) & arms.on_task[which]
         waits = turned & near & (arms.next_vertex[which] < 0) & (arms.hesitated[which] < _HESITATION)
         arms.hesitated[which[waits]] += 1
         steps.points[waits], steps.codes[waits] = arms.p[which[waits]], HOLDING
@@ -158,15 +159,15 @@ class Pilot:
         steps.points[direct], steps.codes[direct] = arms.p[which[direct]], UNREACHABLE
         rows = (known & ~direct).nonzero()[0]
         if len(rows):
-            chosen, lost = which[rows], lost[rows]
-            goals = np.where(lost[:, None], arms.held[chosen], targets[rows])
-            lines, found = self._lines(arms, chosen, goals, ends[rows], lost)
-            free = (found | lost) & lines.direct & arms.on_task[chosen]
+            chosen, holding = which[rows], lost[rows]
+            goals = np.where(holding[:, None], arms.held[chosen], targets[rows])
+            lines, found = self._lines(arms, chosen, goals, ends[rows], holding)
+            free = (found | holding) & lines.direct & arms.on_task[chosen]
             direct[rows], valid[rows] = free, found & (free | ~arms.barred_from(chosen, goals, SAME_GOAL))
-            ends[rows[~lost]] = lines.ends[~lost]
+            ends[rows[~holding]] = lines.ends[~holding]
             steps.q[rows[free]], steps.goals[rows[free]] = lines.steps[free], lines.ends[free]
             steps.points[rows[free]] = lines.points[free]
-            steps.codes[rows[free]] = np.where(lost, UNREACHABLE, TRACKING)[free]
+            steps.codes[rows[free]] = np.where(holding, UNREACHABLE, TRACKING)[free]
         return steps, ends, valid, direct
 
     def _rests(self, arms: Arms, which: Array, lost: Mask) -> Mask:
@@ -183,7 +184,8 @@ class Pilot:
 
         Arms that are `lost` (A,) go to where they hold, in as many steps as are left for that.
         """
-        offsets = np.where(lost[:, None], 0.0, arms.offsets[which])
+        same = ~lost & (norms(goals - arms.offset_at[which]) <= SAME_GOAL)
+        offsets = np.where(same[:, None], arms.offsets[which], 0.0)
         pace = np.where(lost, 1.0 / arms.due[which], 1.0)
         arms.due[which] = np.maximum(arms.due[which] - 1, 1)
         stretched = (norms(offsets) > _NEAR).nonzero()[0]
@@ -197,7 +199,7 @@ class Pilot:
         if far.any():
             both = (torch.from_numpy(part[far]) for part in (lines.ends, guesses))
             found[far] = self.solver.on_map(*both).numpy()
-        arms.offsets[which] = np.where(found[:, None], offsets, 0.0)
+        arms.offsets[which], arms.offset_at[which] = np.where(found[:, None], offsets, 0.0), goals
         return lines, found
 
     def _hold(self, arms: Arms, which: Array, targets: Array) -> None:
@@ -212,6 +214,7 @@ class Pilot:
         arms.due[which[norms(found[0] - arms.held[which]) != 0.0]] = _GRADUALLY
         arms.held[which], arms.held_q[which], arms.solvable[which] = found
         arms.closely[which], arms.searched[which], arms.sought[which] = ~closely, True, targets
+        arms.offset_at[which] = np.nan
 
     def _lead(self, round_: _Round, routed: Mask, on_way: Mask, briefly: Mask) -> Mask:
         """Sets the steps of arms on routes: of those that have just been `routed`, or else taken back to their map.

@@ -39,7 +39,8 @@ class Command:
         configuration: (*batch, n) configurations for the next control step [rad or m]; continuous joints are not
             wrapped, so that a controller may subtract.
         status: (*batch,) array of text: "tracking" the target; "detouring", on a planned way to it or back to the
-            map; "holding", because the input was refused or there is no way on; "unreachable": the target cannot be
+            map; "holding", because the input was refused, there is no way on, or the arm waits two
+            steps before it sets off on a detour for a target next to it; "unreachable": the target cannot be
             reached, and the arm goes to the nearest point that can.
     """
 

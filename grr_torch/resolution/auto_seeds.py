@@ -38,7 +38,7 @@ _COARSE = {2: 120, 3: 300}
 _TURNED, _FEWEST = 4, 8
 # of a task graph with more vertices, on which a trial would take long, the best coarse map is taken as it is
 _MOST_TRIED = 10_000
-# of a projection on the coarse graph: what takes longer is out of reach, or a bad posture
+# of a projection in an expansion over the coarse graph: what takes longer is out of reach, or a bad posture
 _ITERATIONS = 8
 # vertices averaged over on it
 _NEIGHBOURS = 24
