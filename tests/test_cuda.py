@@ -96,6 +96,18 @@ def test_points_are_solved_alike(file, generator, count):
     assert bool(found.configurations[~found.valid].isnan().all())
 
 
+def test_points_of_turning_tools_are_solved_alike(tmp_path, generator):
+    path = tmp_path / "pose.grr"
+    grr_torch.build(grr_torch.load_robot("planar_5"), "pose", points=200, rotations=6).save(path)
+    cpu, cuda = (grr_torch.Roadmap.load(path, device=device) for device in ("cpu", "cuda"))
+    points = 0.8 * (torch.rand(1000, 3, dtype=torch.float64, generator=generator) - 0.5)
+    expected, found = cpu.solve(points), cuda.solve(points)
+    assert (found.status == expected.status).mean() > 0.99
+    both = expected.valid & found.valid.cpu()
+    assert int(both.sum()) > 100
+    torch.testing.assert_close(found.configurations.cpu()[both], expected.configurations[both], atol=1e-6, rtol=0)
+
+
 def test_training_ends_as_well_and_its_file_is_read_anywhere(file, tmp_path, generator):
     cpu, cuda = (grr_torch.Roadmap.load(file, device=device) for device in ("cpu", "cuda"))
     options = TrainingOptions(samples=5000, epochs=6, batch=256)

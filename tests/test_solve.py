@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 import grr_torch
+from grr_torch.applications.many_guesses import ManyGuesses
 from grr_torch.applications.solve import STATUSES
 from grr_torch.errors import ParameterError
 from grr_torch.spaces.cliques import triangles
@@ -164,3 +167,24 @@ def test_points_beyond_all_numbers_are_outside(planar_roadmap):
     solution = planar_roadmap.solve(points)
     assert solution.status.tolist() == ["outside"] * 3
     assert not bool(solution.valid.any())
+
+
+@pytest.mark.parametrize("connected", ["as built", "a third", "none"])
+def test_guesses_by_matrices_are_those_by_trees(roadmap, connected):
+    """What a GPU computes, here on the CPU: vertices, parts and averages are the same."""
+    generator = torch.Generator().manual_seed(4)
+    share = {"as built": 1.0, "a third": 0.33, "none": 0.0}[connected]
+    kept = torch.rand(len(roadmap.edges), generator=generator) < share
+    thinned = dataclasses.replace(roadmap, connected=roadmap.connected & kept)
+    low, high = roadmap.points.amin(0) - 0.1, roadmap.points.amax(0) + 0.1
+    points = low + (high - low) * torch.rand(3000, len(low), dtype=torch.float64, generator=generator)
+    points = torch.cat([points, torch.full_like(points[:1], 1e300)])
+    solver = thinned.solver
+    expected, codes = solver.guess(points, certified=False)
+    by_matrices = ManyGuesses(thinned, solver.vertices, solver.radius, torch.device("cpu"))
+    found, nearest, known = by_matrices(points)
+    inside = codes.numpy() != STATUSES.index("outside")
+    assert 0 < known.sum() < len(points)
+    assert (known[inside] == (codes.numpy() <= 1)[inside]).all()
+    torch.testing.assert_close(found[known], expected[known], atol=1e-12, rtol=0)
+    assert (solver.vertices[nearest][known] == solver.nearest(points[known])[1][:, 0]).all()

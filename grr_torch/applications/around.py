@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
 # a guess averages over so many vertices, in the plane and in space: a grid's first two shells
-_NEIGHBOURS = {2: 8, 3: 14}
+NEIGHBOURS = {2: 8, 3: 14}
 # and where rotation varies, over so many positions, in so many rotations each, by the entries of these
 _PLACES = {2: 4, 3: 8}
 _TURNS = {1: 2, 3: 4, 4: 6}
 # no vertex farther than so many of the longest edges counts, and one must lie within one of them
-_FARTHEST = 1.5
+FARTHEST = 1.5
 # of so many points the neighbours are searched for on all processors
 _MANY = 1000
 # distances to all vertices that are held at once
@@ -45,11 +45,11 @@ class Around:
             Ranks (N, K) among the resolved ones, the nearest first, their weights (N, K), and which points (N,) lie
             near enough to one.
         """
-        k = min(_NEIGHBOURS[self._d], self._count)
+        k = min(NEIGHBOURS[self._d], self._count)
         places = points[:, : self._d].numpy()
         # the one after the k-th is at infinity where there is none
         distances, nearest = self._tree.query(places, k + 1, workers=-1 if len(points) > _MANY else 1)
-        weights = _weights(distances, k, _FARTHEST * self._radius)
+        weights = _weights(distances, k, FARTHEST * self._radius)
         return self._ranks(nearest[:, :k]), weights, distances[:, 0] <= self._radius
 
     def _ranks(self, nearest: Array) -> Array:
@@ -92,7 +92,7 @@ class AroundProduct:
         turns, apart = self._graph.nearest_rotations(points[:, d:], wanted + 1)
         # the root of 1 − cos grows with the angle
         by_turn = torch.from_numpy(_weights(apart.clamp_min(0.0).sqrt().numpy(), wanted, math.inf))
-        by_place = torch.from_numpy(_weights(distances, k, _FARTHEST * self._radius))
+        by_place = torch.from_numpy(_weights(distances, k, FARTHEST * self._radius))
         ranks = self._rank[(turns[:, :wanted, None] * size + places[:, None]).flatten(1)]
         weights = torch.where(ranks >= 0, (by_turn[:, :, None] * by_place[:, None]).flatten(1), 0.0)
         weights, order = weights.sort(dim=1, descending=True)

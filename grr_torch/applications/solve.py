@@ -13,8 +13,9 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from grr_torch.applications.around import Around, AroundProduct
+from grr_torch.applications.many_guesses import MOST_VERTICES, ManyGuesses
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import FEW, Array, one_thread, together
+from grr_torch.pieces import FEW, Array, Mask, one_thread, together
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
@@ -85,6 +86,8 @@ class Solver:
         self.radius = roadmap.longest_edge
         turning = self.task.rotations is not None
         self._around = (AroundProduct if turning else Around)(roadmap, vertices, self.radius)
+        device, many = self.robot.device, not turning and len(vertices) <= MOST_VERTICES
+        self._many = ManyGuesses(roadmap, vertices, self.radius, device) if many and device.type != "cpu" else None
         self._continuous = self.robot.continuous.cpu()
         self._embedded = embed(roadmap.configurations[vertices].to(torch.float64), self._continuous)
         self._embedded_array, self._continuous_array = self._embedded.numpy(), self._continuous.numpy()
@@ -148,19 +151,23 @@ class Solver:
     def guess(self, points: Tensor, *, certified: bool = True) -> tuple[Tensor, Tensor]:
         """Averages (N, n) for points (N, width) on the CPU, and what is known of the points so far (N,).
 
-        2n multiply-adds a neighbour, and k³ a doubling of the paths by which connected vertices are found. Whether the
-        points' cells are certified is looked up only if asked for.
+        The averages may be on the robot's device. 2n multiply-adds a neighbour, and k³ a doubling of the paths by which
+        connected vertices are found. Whether the points' cells are certified is looked up only if asked for.
         """
         positions = points[:, : self.task.dimension].numpy()
-        nearest, weights, near = self._around.weigh(points)
-        weights = weights * self._largest_part(nearest, weights > 0.0)
-        averages = self._averages(nearest, weights)
+        averages, nearest, known = self._known(points) if self._many is None else self._many(points)
         codes = np.full(len(points), _SOLVED, dtype=np.uint8)
         if certified:
-            self._mark_uncertified(codes, positions, nearest[:, 0])
-        codes[~near | ~(weights.sum(1) > 0.0)] = _TOO_FAR
+            self._mark_uncertified(codes, positions, nearest)
+        codes[~known] = _TOO_FAR
         codes[((positions < self._low) | (positions > self._high)).any(1)] = _OUTSIDE
         return averages, torch.from_numpy(codes)
+
+    def _known(self, points: Tensor) -> tuple[Tensor, Array, Mask]:
+        """Averages (N, n) for points (N, width), their nearest vertices' ranks (N,), and which there are (N,)."""
+        nearest, weights, near = self._around.weigh(points)
+        weights = weights * self._largest_part(nearest, weights > 0.0)
+        return self._averages(nearest, weights), nearest[:, 0], near & (weights.sum(1) > 0.0)
 
     def _averages(self, nearest: Array, weights: Array) -> Tensor:
         """(N, n) circular averages over vertices (N, k), weighted (N, k)."""
