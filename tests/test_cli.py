@@ -10,7 +10,10 @@ import sys
 import time
 
 import pytest
+import torch
+import typer
 from grr_torch.cli.main import join_bounds
+from grr_torch.cli.show import reports_errors
 
 import grr_torch
 
@@ -243,13 +246,25 @@ def test_ctrl_c_leaves_no_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["build"], ["info"], ["view"], ["solve"], ["plan"], ["teleop"], ["smm"], ["robots"], ["spheres"]]
+    "command",
+    ["", "build", "info", "view", "solve", "plan", "teleop", "smm", "robots", "spheres", "export", "bench devices"],
 )
 def test_help_has_an_example(tmp_path, command):
-    result = run(*command, "--help", cwd=tmp_path)
+    result = run(*command.split(), "--help", cwd=tmp_path)
     assert result.returncode == 0
     assert "grr-torch" in result.stdout
     assert not command or "Example:" in result.stdout
+
+
+def test_a_full_device_is_one_clear_line(capsys):
+    @reports_errors
+    def command():
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.\nMore of it.")
+
+    with pytest.raises(typer.Exit) as caught:
+        command()
+    assert caught.value.exit_code == 2
+    assert "the device's memory is full: CUDA out of memory. Tried to allocate 20.00 GiB." in capsys.readouterr().err
 
 
 def test_help_imports_nothing_heavy(tmp_path):

@@ -155,6 +155,7 @@ def bad_files(folder):
         ("solve --point 0 b r.grr", "--point: got '0 b'; valid: 2 finite numbers: x y"),
         ("solve r.grr --point 0 nan", "2 finite numbers: x y"),
         ("solve none.grr --point 0 0", "none.grr: is not a file"),
+        ("solve r.grr --point 0 0 --device tpu9", "device: got tpu9; valid: cpu"),
         ("solve good.csv --point 0 0", "truncated or not a roadmap"),
         ("solve r.grr --points good.csv", "--out: got nothing"),
         ("solve r.grr --points good.csv --out good.csv", "another file than those that are read"),

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 # of larger roadmaps, a tree on the CPU is as fast as all distances
 MOST_VERTICES = 1 << 15
-# distances held at once: 512 MiB
+# distances held at once: 256 MiB
 _AT_ONCE = 1 << 26
+# vertices more than are wanted, as rounding may have put some before others
+_SPARE = 3
 
 
 class ManyGuesses:
@@ -62,10 +64,15 @@ class ManyGuesses:
 
     def _nearest(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Distances (N, k + 1) of the nearest vertices, infinite where there are no more, and ranks (N, k)."""
-        apart = torch.cdist(places, self._points, compute_mode="donot_use_mm_for_euclid_dist")
-        found = apart.topk(min(self._k + 1, len(self._points)), largest=False)
-        beyond = apart.new_full((len(places), self._k + 1 - found.values.shape[1]), torch.inf)
-        return torch.cat([found.values, beyond], dim=1), found.indices[:, : self._k]
+        # in single precision, then among a few more than are wanted in double
+        squared = places.new_zeros(len(places), len(self._points), dtype=torch.float32)
+        for place, of_all in zip(places.float().unbind(1), self._points.float().unbind(1), strict=True):
+            squared.add_((place[:, None] - of_all).square_())
+        index = squared.topk(min(self._k + 1 + _SPARE, len(self._points)), largest=False, sorted=False).indices
+        apart, order = (places[:, None] - self._points[index]).norm(dim=2).sort(dim=1)
+        beyond = apart.new_full((len(places), max(0, self._k + 1 - apart.shape[1])), torch.inf)
+        distances = torch.cat([apart, beyond], dim=1)[:, : self._k + 1]
+        return distances, index.gather(1, order)[:, : self._k]
 
     def _largest_part(self, nearest: Tensor, counts: Tensor) -> Tensor:
         """Which of the vertices (N, k) that count lie in the largest part connected by edges among them."""
