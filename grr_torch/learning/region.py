@@ -15,13 +15,14 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError
 from grr_torch.progress import Progress, silent
-
-# simplices round a point, by their centres, in which it may lie
-_NEAR = 32
+from grr_torch.spaces.pyramids import pyramid_corners
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
     from grr_torch.spaces.lattice import Lattice
+
+# simplices round a point, by their centres, in which it may lie
+_NEAR = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,19 +125,9 @@ def _all_known(simplices: Tensor, triangles: Tensor, count: int, *, apex: bool =
 def _pyramids(lattice: Lattice) -> Tensor:
     """(P, 5) in space, (P, 3) in the plane: the centre of a cell, then the corners round one of its faces."""
     d = len(lattice.cells)
-    counts = [count + 1 for count in lattice.cells]
-    corner = torch.arange(math.prod(counts)).reshape(counts)
-    centre = math.prod(counts) + torch.arange(math.prod(lattice.cells))
-    around = [(0,), (1,)] if d == 2 else [(0, 0), (1, 0), (1, 1), (0, 1)]
-    found: list[Tensor] = []
-    for axis, side in itertools.product(range(d), (0, 1)):
-        ring = []
-        for place in around:
-            shift = [*place[:axis], side, *place[axis:]]
-            window = tuple(slice(s, s + n) for s, n in zip(shift, lattice.cells, strict=True))
-            ring.append(corner[window].reshape(-1))
-        found.append(torch.stack([centre, *ring], dim=1))
-    return torch.cat(found)
+    # by face, so that all of one kind lie together
+    corners = pyramid_corners(lattice).unflatten(0, (-1, 2 * d)).transpose(0, 1).flatten(0, 1)
+    return corners[:, [2, 0, 1] if d == 2 else [4, 0, 2, 3, 1]]
 
 
 def _delaunay(roadmap: Roadmap) -> Tensor:
