@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import sys
 from collections.abc import Sequence
@@ -83,39 +84,42 @@ def run(arguments: Sequence[str] | None = None) -> None:
 
 # options that take as many numbers as follow
 _OF_NUMBERS = ("--bounds", "--point", "--start", "--goal", "--start-configuration", "--goal-configuration")
+# what a file's name has in it, and no number
+_FILE = re.compile(r"[/\s]|\.[A-Za-z]\w*$")
 
 
 def join_bounds(arguments: list[str]) -> list[str]:
-    """Puts the numbers after --bounds, --point and their like into one argument: typer takes a fixed number else."""
+    """Puts the numbers after --bounds, --point and their like into one argument: typer takes a fixed number else.
+
+    Words that were to be numbers are among them, so that the error names the option.
+    """
     joined: list[str] = []
     position = 0
     while position < len(arguments):
-        joined.append(arguments[position])
+        option = arguments[position]
         position += 1
-        if joined[-1] in _OF_NUMBERS:
-            numbers: list[str] = []
-            while position < len(arguments) and _is_value(arguments[position], numbers, arguments[position + 1 :]):
-                numbers.append(arguments[position])
-                position += 1
-            if numbers:
-                joined[-1] = f"{joined[-1]}={' '.join(numbers)}"
+        words: list[str] = []
+        if option in _OF_NUMBERS:
+            words = list(itertools.takewhile(_may_be_a_number, arguments[position:]))
+            # after as many numbers, a word may be the file's name, unless there is one or none is taken
+            wrong = len(words) > 1 and [_is_a_number(word) for word in words] == [True] * (len(words) - 1) + [False]
+            if wrong and option != "--bounds" and not any(map(_FILE.search, arguments)) and words[-1][0].isalpha():
+                words.pop()
+            position += len(words)
+        joined.append(f"{option}={' '.join(words)}" if words else option)
     return joined
 
 
-def _is_value(text: str, before: list[str], after: list[str]) -> bool:
-    """Whether a word is a number, or one that was to be: the error names it then.
-
-    What follows numbers, and is the last word or the last before an option, may be a file.
-    """
-    among = bool(after) and not after[0].startswith("--")
-    return _like_a_number(text) or (text.isalnum() and (among or not any(map(_like_a_number, before))))
+def _may_be_a_number(word: str) -> bool:
+    """Whether a word is neither an option nor a file's name."""
+    return _is_a_number(word) or (not (word.startswith("-") and not word[1:2].isdigit()) and not _FILE.search(word))
 
 
-def _like_a_number(text: str) -> bool:
+def _is_a_number(word: str) -> bool:
     try:
-        float(text)
+        float(word)
     except ValueError:
-        return re.fullmatch(r"[+-]?\.?\d\S*", text) is not None
+        return False
     return True
 
 

@@ -35,12 +35,15 @@ def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
         except GrrError as error:
             typer.secho(f"error: {error}", err=True, fg=typer.colors.RED)
             raise typer.Exit(2) from error
-        except RuntimeError as error:
-            # torch's: it is not imported here, where it may not be needed
-            if type(error).__name__ != "OutOfMemoryError":
+        except (RuntimeError, MemoryError) as error:
+            # torch's are RuntimeErrors; it is not imported here, where it may not be needed
+            full = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+            if not full and "can't allocate memory" not in str(error):
                 raise
-            given = str(error).splitlines()[0]
-            typer.secho(f"error: the device's memory is full: {given}", err=True, fg=typer.colors.RED)
+            given = (str(error).splitlines() or [type(error).__name__])[0]
+            typer.secho(
+                f"error: the memory is full, of this machine or its GPU: {given}", err=True, fg=typer.colors.RED
+            )
             raise typer.Exit(2) from error
         except KeyboardInterrupt as error:
             typer.echo("interrupted: nothing was written", err=True)

@@ -256,15 +256,34 @@ def test_help_has_an_example(tmp_path, command):
     assert not command or "Example:" in result.stdout
 
 
-def test_a_full_device_is_one_clear_line(capsys):
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 GiB.\nMore."), "Tried to allocate 20 GiB.\n"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), "can't allocate memory"),
+        (MemoryError(), "MemoryError"),
+    ],
+)
+def test_a_full_memory_is_one_clear_line(capsys, error, said):
     @reports_errors
     def command():
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.\nMore of it.")
+        raise error
 
     with pytest.raises(typer.Exit) as caught:
         command()
     assert caught.value.exit_code == 2
-    assert "the device's memory is full: CUDA out of memory. Tried to allocate 20.00 GiB." in capsys.readouterr().err
+    message = capsys.readouterr().err
+    assert message.startswith("error: the memory is full")
+    assert said in message
+
+
+def test_another_error_of_torch_is_not_hidden():
+    @reports_errors
+    def command():
+        raise RuntimeError("mixed devices")
+
+    with pytest.raises(RuntimeError, match="mixed"):
+        command()
 
 
 def test_help_imports_nothing_heavy(tmp_path):

@@ -10,8 +10,10 @@ import grr_torch
 from grr_torch.learning.dataset import RoadmapDataset
 from grr_torch.learning.export import export_dataset
 from grr_torch.learning.neural_ik import NeuralIK
+from grr_torch.learning.onnx import export_torch
 from grr_torch.learning.options import TrainingOptions
 from grr_torch.learning.train import train_ik
+from grr_torch.resolution.verify import verify_file
 from grr_torch.spaces.configuration import difference
 from grr_torch.spaces.task import FixedRotation
 
@@ -59,6 +61,15 @@ def test_roadmaps_are_as_good(robot, task):
     assert found.connected_edges == pytest.approx(expected.connected_edges, rel=0.005)
     assert found.smoothness == pytest.approx(expected.smoothness, rel=0.01)
     assert found.self_collisions in (None, 0)
+
+
+@pytest.mark.parametrize(("robot", "task"), [("planar_5", "fixed-rotation"), ("kinova", "position")])
+def test_what_was_built_on_a_gpu_is_verified_anywhere(robot, task, tmp_path):
+    path = tmp_path / "roadmap.grr"
+    grr_torch.build(grr_torch.load_robot(robot, device="cuda"), task).save(path)
+    assert all(check.passed for check in verify_file(path))
+    loaded = grr_torch.Roadmap.load(path)
+    assert loaded.robot.device.type == loaded.configurations.device.type == "cpu"
 
 
 @pytest.mark.parametrize(
@@ -118,6 +129,8 @@ def test_training_ends_as_well_and_its_file_is_read_anywhere(file, tmp_path, gen
     again = NeuralIK.load(tmp_path / "ik.safetensors", cpu.robot)
     apart = difference(found(points.cuda()).cpu(), again(points), cpu.robot.continuous).abs()
     assert (apart < 1e-3).double().mean() > 0.99
+    export_torch(found.network, found.origin, tmp_path / "ik.pt2")
+    assert found.network.last.weight.device.type == "cuda"
     _, valid = found.refine(points.cuda(), 3)
     assert valid.device.type == "cuda"
     assert (valid.cpu() == again.refine(points, 3)[1]).double().mean() > 0.99

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -181,10 +182,38 @@ def test_guesses_by_matrices_are_those_by_trees(roadmap, connected):
     points = torch.cat([points, torch.full_like(points[:1], 1e300)])
     solver = thinned.solver
     expected, codes = solver.guess(points, certified=False)
-    by_matrices = ManyGuesses(thinned, solver.vertices, solver.radius, torch.device("cpu"))
+    by_matrices = ManyGuesses(thinned, solver.vertices, solver.radius)
     found, nearest, known = by_matrices(points)
     inside = codes.numpy() != STATUSES.index("outside")
     assert 0 < known.sum() < len(points)
     assert (known[inside] == (codes.numpy() <= 1)[inside]).all()
     torch.testing.assert_close(found[known], expected[known], atol=1e-12, rtol=0)
     assert (solver.vertices[nearest][known] == solver.nearest(points[known])[1][:, 0]).all()
+
+
+def test_guesses_by_matrices_do_not_depend_on_where_the_map_is(planar_roadmap):
+    """Distances are first compared in single precision."""
+    shift = 10_000.0
+    moved = dataclasses.replace(planar_roadmap, points=planar_roadmap.points + shift)
+    generator = torch.Generator().manual_seed(5)
+    points = torch.rand(2000, 2, dtype=torch.float64, generator=generator) - 0.5
+    vertices = planar_roadmap.solver.vertices
+    here, there = (
+        ManyGuesses(roadmap, vertices, planar_roadmap.longest_edge)(points + at)
+        for roadmap, at in ((planar_roadmap, 0.0), (moved, shift))
+    )
+    both = here[2] & there[2]
+    assert (here[2] == there[2]).mean() > 0.99
+    torch.testing.assert_close(here[0][both], there[0][both], atol=1e-5, rtol=0)
+
+
+def test_a_map_without_edges_has_guesses_too(planar_5):
+    graph = grr_torch.TaskGraph(torch.tensor([[0.3, 0.1]], dtype=torch.float64), torch.empty(0, 2, dtype=torch.long))
+    roadmap = grr_torch.build(planar_5, "position", points=graph, seeds=[[0.1, 0.2, 0.2, 0.2, 0.2]])
+    assert roadmap.longest_edge == math.inf
+    points = torch.tensor([[0.3, 0.1], [0.31, 0.12]], dtype=torch.float64)
+    assert bool(roadmap.solve(points).valid.any())
+    averages, nearest, known = ManyGuesses(roadmap, roadmap.solver.vertices, roadmap.longest_edge)(points)
+    torch.testing.assert_close(averages, roadmap.configurations.expand(2, -1))
+    assert known.all()
+    assert (nearest == 0).all()

@@ -39,8 +39,8 @@ class Arms:
         aimed: (B, width) the target for which it does so; a target elsewhere is looked for at once.
         doubt: (B,) how many these are the next time.
         hesitated: (B,) steps for which an arm has waited before a detour since it last went straight.
-        offsets: (B, n) what the end of the last line to a target differed from its guess by, and
-        offset_at: (B, width) the target; NaN where there was none.
+        offsets: (B, n) what the end of the last line differed from its guess by; 0 where it was not to a target.
+        offset_at: (B, width) where that line led; NaN where there was none.
         barred: (B, width) the last target that a route led near, without a way on from there; NaN where there is none.
         avoided: Of each arm, the edges that it could not follow since it last went straight.
     """

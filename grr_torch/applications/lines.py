@@ -120,7 +120,7 @@ class Follower:
             targets: (B, width) the ends.
             offsets: (B, n) what the ends are expected to differ from their guesses by, as they did in the last step:
                 lines lead there, so that steps are not short where guesses are far off. By default nothing.
-            pace: (B,) the most of a line that one step covers, from above 0 to 1; the whole line by default.
+            pace: (B,) the most of a line that one step covers, above 0; from 1 on, the default, all of it.
         """
         motion = self.difference(q, guesses if offsets is None else guesses + offsets)
         aim = self._aim(q, motion, pace)

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 # of larger roadmaps, a tree on the CPU is as fast as all distances
 MOST_VERTICES = 1 << 15
-# distances held at once: 256 MiB
+# distances held at once: 256 MiB, and as much again while they are added up
 _AT_ONCE = 1 << 26
+# what a point takes at least, in distances
+_KEYS = 1 << 10
 # vertices more than are wanted, as rounding may have put some before others
 _SPARE = 3
 
@@ -29,9 +31,9 @@ class ManyGuesses:
     Rotation does not vary in the task.
     """
 
-    def __init__(self, roadmap: Roadmap, vertices: Tensor, radius: float, device: torch.device) -> None:
+    def __init__(self, roadmap: Roadmap, vertices: Tensor, radius: float) -> None:
         """For the resolved vertices (S,) of a roadmap, whose longest edge is `radius` [m]."""
-        d = roadmap.task.dimension
+        d, device = roadmap.task.dimension, roadmap.robot.device
         self._d, self._radius, self._k = d, radius, min(NEIGHBOURS[d], len(vertices))
         self._continuous = roadmap.robot.continuous.to(device)
         self._points = roadmap.points[vertices, :d].to(device)
@@ -48,7 +50,7 @@ class ManyGuesses:
             Averages (N, n) on the device, the nearest vertices' ranks (N,), and which averages there are (N,).
         """
         places = points[:, : self._d].to(self._points)
-        parts = [self._guess(part) for part in places.split(max(1, _AT_ONCE // len(self._points)))]
+        parts = [self._guess(part) for part in places.split(max(1, _AT_ONCE // max(len(self._points), _KEYS)))]
         averages, first, known = (torch.cat(part) for part in zip(*parts, strict=True))
         return averages, first.cpu().numpy(), known.cpu().numpy()
 
@@ -56,7 +58,8 @@ class ManyGuesses:
         distances, nearest = self._nearest(places)
         near = distances[:, : self._k].clamp_min(1e-12)
         reach = distances[:, self._k :].clamp_max(FARTHEST * self._radius)
-        weights = (reach / near - 1.0).clamp_min(0.0).square()
+        # where there is no next one, 1 / d²
+        weights = torch.where(reach.isfinite(), (reach / near - 1.0).clamp_min(0.0), 1.0 / near).square()
         weights = weights * self._largest_part(nearest, weights > 0.0)
         sums = embedding_bag(nearest, self._embedded, per_sample_weights=weights, mode="sum")
         known = (distances[:, 0] <= self._radius) & (weights.sum(1) > 0.0)
@@ -66,7 +69,8 @@ class ManyGuesses:
         """Distances (N, k + 1) of the nearest vertices, infinite where there are no more, and ranks (N, k)."""
         # in single precision, then among a few more than are wanted in double
         squared = places.new_zeros(len(places), len(self._points), dtype=torch.float32)
-        for place, of_all in zip(places.float().unbind(1), self._points.float().unbind(1), strict=True):
+        centred = ((part - self._points.mean(0)).float().unbind(1) for part in (places, self._points))
+        for place, of_all in zip(*centred, strict=True):
             squared.add_((place[:, None] - of_all).square_())
         index = squared.topk(min(self._k + 1 + _SPARE, len(self._points)), largest=False, sorted=False).indices
         apart, order = (places[:, None] - self._points[index]).norm(dim=2).sort(dim=1)
@@ -86,8 +90,8 @@ class ManyGuesses:
             # paths of twice as many edges
             steps = joined.to(torch.float32)
             joined = torch.bmm(steps, steps) > 0.0
-        sizes = joined.sum(2)
-        largest = (k * sizes - torch.arange(k, device=keys.device)).argmax(1)
+        # the first of equals
+        largest = joined.sum(2).argmax(1)
         return joined.take_along_dim(largest[:, None, None], dim=1)[:, 0]
 
     def _key(self, first: Tensor, second: Tensor) -> Tensor:

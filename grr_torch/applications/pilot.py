@@ -214,7 +214,6 @@ class Pilot:
         arms.due[which[norms(found[0] - arms.held[which]) != 0.0]] = _GRADUALLY
         arms.held[which], arms.held_q[which], arms.solvable[which] = found
         arms.closely[which], arms.searched[which], arms.sought[which] = ~closely, True, targets
-        arms.offset_at[which] = np.nan
 
     def _lead(self, round_: _Round, routed: Mask, on_way: Mask, briefly: Mask) -> Mask:
         """Sets the steps of arms on routes: of those that have just been `routed`, or else taken back to their map.

@@ -86,8 +86,8 @@ class Solver:
         self.radius = roadmap.longest_edge
         turning = self.task.rotations is not None
         self._around = (AroundProduct if turning else Around)(roadmap, vertices, self.radius)
-        device, many = self.robot.device, not turning and len(vertices) <= MOST_VERTICES
-        self._many = ManyGuesses(roadmap, vertices, self.radius, device) if many and device.type != "cpu" else None
+        many = self.robot.device.type != "cpu" and not turning and len(vertices) <= MOST_VERTICES
+        self._many = ManyGuesses(roadmap, vertices, self.radius) if many else None
         self._continuous = self.robot.continuous.cpu()
         self._embedded = embed(roadmap.configurations[vertices].to(torch.float64), self._continuous)
         self._embedded_array, self._continuous_array = self._embedded.numpy(), self._continuous.numpy()
@@ -151,8 +151,8 @@ class Solver:
     def guess(self, points: Tensor, *, certified: bool = True) -> tuple[Tensor, Tensor]:
         """Averages (N, n) for points (N, width) on the CPU, and what is known of the points so far (N,).
 
-        The averages may be on the robot's device. 2n multiply-adds a neighbour, and k³ a doubling of the paths by which
-        connected vertices are found. Whether the points' cells are certified is looked up only if asked for.
+        The averages may be on the robot's device. 2n multiply-adds a neighbour, and the search for the connected ones.
+        Whether the points' cells are certified is looked up only if asked for.
         """
         positions = points[:, : self.task.dimension].numpy()
         averages, nearest, known = self._known(points) if self._many is None else self._many(points)

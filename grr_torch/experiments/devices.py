@@ -35,7 +35,8 @@ class Result:
     Attributes:
         work: What was done.
         device: Where.
-        seconds: How long it took; the median of several, but of what takes minutes.
+        seconds: How long it took: of roadmaps and of solving the median of several runs; of an export all of the first
+            run, of training the mean epoch.
         outcome: Figures of what came out.
     """
 
@@ -157,7 +158,7 @@ def _export(path: Path, device: str, samples: int) -> Result:
 
 def _train(path: Path, device: str, samples: int, epochs: int) -> Result:
     roadmap = Roadmap.load(path, device=device)
-    options = TrainingOptions(samples=samples, epochs=epochs)
+    options = TrainingOptions(samples=samples, epochs=epochs, patience=epochs)
     dataset = RoadmapDataset(roadmap, samples, split=options.parted(), seed=options.seed)
     begin = time.perf_counter()
     record = train_ik(roadmap, options, dataset=dataset).origin.training

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import os
@@ -114,7 +115,9 @@ class NeuralIK:
         if robot_hash(robot) != origin.robot_hash:
             given = f"weights for {origin.robot} with joints {', '.join(origin.joint_names)}"
             raise ParameterError("weights", given, f"weights for this {robot.name} with its base, tool and held joints")
-        self.network, self.robot = network.eval().to(robot.device), robot
+        elsewhere = network.encoding.scale.device != robot.device
+        self.network = (copy.deepcopy(network).to(robot.device) if elsewhere else network).eval()
+        self.robot = robot
         self.task, self.origin = origin.task, origin
 
     def __call__(self, points: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
 import json
 import logging
@@ -37,11 +38,12 @@ def export_onnx(network: IkNetwork, origin: Origin, path: str | os.PathLike[str]
         OutputError: It cannot be written, or does not give what the network gives.
     """
     runtime, onnx = _onnx_packages()
+    network = copy.deepcopy(network).cpu().eval()
     points = torch.zeros(2, origin.task.width)
     dynamic = {"points": {0: torch.export.Dim("N", min=1)}}
     with _quiet():
         program: Any = torch.onnx.export(
-            network.eval(),
+            network,
             (points,),
             dynamo=True,
             verbose=False,
@@ -67,10 +69,9 @@ def export_torch(network: IkNetwork, origin: Origin, path: str | os.PathLike[str
     Raises:
         OutputError: It cannot be written, or does not give what the network gives.
     """
+    network = copy.deepcopy(network).cpu().eval()
     points = torch.zeros(2, origin.task.width)
-    program = torch.export.export(
-        network.eval(), (points,), dynamic_shapes={"points": {0: torch.export.Dim("N", min=1)}}
-    )
+    program = torch.export.export(network, (points,), dynamic_shapes={"points": {0: torch.export.Dim("N", min=1)}})
     buffer = io.BytesIO()
     torch.export.save(program, buffer, extra_files={"grr_torch.json": json.dumps(origin.to_dict())})
     with atomic_write(path) as temporary:

@@ -51,7 +51,7 @@ def train_ik(
     The loss is chordal in joint space, and the tool's distance and rotation through differentiable forward kinematics.
     What is kept is the network of the epoch with the least loss on the validation part. Training runs on the device of
     the roadmap's robot, of the CPU on one thread, and is repeatable there: the same options give the same network on
-    the same machine, taken up again or not.
+    the same machine, taken up again or not (on a GPU as far as its sums are in one order).
 
     Args:
         roadmap: The roadmap.

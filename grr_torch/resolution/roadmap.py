@@ -137,11 +137,13 @@ class Roadmap:
     @cached_property
     def longest_edge(self) -> float:
         """How far apart the positions of the ends of an edge are, at most [m]; inf without edges."""
+        if len(self.edges) == 0:
+            return math.inf
         columns = self.points[:, : self.task.dimension].T.contiguous()
-        longest = -math.inf
+        longest = 0.0
         for first, second in (part.T for part in self.edges.split(_EDGES_AT_ONCE)):
             longest = max(longest, float((columns[:, first] - columns[:, second]).square_().sum(0).max()))
-        return math.sqrt(longest) if len(self.edges) else math.inf
+        return math.sqrt(longest)
 
     @cached_property
     def uncertified(self) -> tuple[Tensor, Tensor]:
@@ -265,7 +267,7 @@ class Roadmap:
         Args:
             path: The file.
             device: Where its robot computes, and what is solved comes out; the CPU by default. Its tables stay on the
-                CPU.
+                CPU, and so do plans, teleoperation and evaluation.
 
         Raises:
             ParameterError: There is no such device.

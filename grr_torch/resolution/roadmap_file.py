@@ -83,8 +83,11 @@ def solving_tables(roadmap: Roadmap) -> dict[str, Tensor]:
 def load_roadmap(
     path: str | os.PathLike[str], robot: Robot | None = None, *, device: torch.device | str | None = None
 ) -> Roadmap:
-    """Reads a roadmap; see `Roadmap.load`. A `robot` may be given in place of the file's, as which it was checked."""
-    on = find_device(device)
+    """Reads a roadmap; see `Roadmap.load`.
+
+    A `robot` may be given in place of the file's, as which it was checked; then it is on its own device.
+    """
+    on = find_device(device) if robot is None else robot.device
     metadata, tensors = read_file(path)
     _check_tensors(path, tensors)
     _check_indices(path, tensors)

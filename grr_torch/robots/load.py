@@ -134,7 +134,7 @@ def find_device(device: torch.device | str | None) -> torch.device:
         ParameterError: There is no such device.
     """
     try:
-        found = torch.device(device or "cpu")
+        found = torch.device("cpu" if device is None else device)
         torch.zeros(1, device=found).cpu()
     except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
         available = "cpu, cuda" if torch.cuda.is_available() else "cpu (no CUDA device is available)"
