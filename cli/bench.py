@@ -66,15 +66,14 @@ def speed(
     import torch
 
     from grr_torch.experiments.speed import measure_speed
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
 
     if threads is not None:
         torch.set_num_threads(threads)
     if profile:
         _show_profile(device)
         return
-    if json_file is not None:
-        check_writable(json_file)
+    check_outputs({"--json": json_file})
     with progress_bar() as progress:
         table = measure_speed(
             sections=only,
@@ -109,10 +108,9 @@ def roadmap(
     """
     from grr_torch.experiments.roadmaps import measure_roadmaps
     from grr_torch.experiments.timing import machine
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
 
-    if json_file is not None:
-        check_writable(json_file)
+    check_outputs({"--json": json_file})
     with progress_bar() as progress:
         results = measure_roadmaps(
             robots=robot, methods=method, reachability=reachability, samples=samples, seed=seed, progress=progress
@@ -144,10 +142,9 @@ def trade(
     Example: grr-torch bench trade --robot kinova --objective clearance --weight 0.3 --weight 1
     """
     from grr_torch.experiments.trade import WEIGHTS, measure_trade
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
 
-    if json_file is not None:
-        check_writable(json_file)
+    check_outputs({"--json": json_file})
     with progress_bar() as progress:
         trades = measure_trade(
             robot, task, objectives=objective, weights=weight or WEIGHTS, seed=seed, progress=progress

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 @reports_errors
 def devices(
     device: Annotated[
-        list[str] | None, typer.Option(help="cpu, cuda, cuda:0, …; repeatable; cpu and cuda by default.")
+        list[str] | None,
+        typer.Option(help="cpu, cuda, cuda:0, …; repeatable; by default cpu, and cuda if there is one."),
     ] = None,
     only: Annotated[
         list[str] | None, typer.Option(help="roadmaps, solve, export, train or large; repeatable; all by default.")
@@ -33,15 +34,16 @@ def devices(
 
     Example: grr-torch bench devices --only roadmaps --only solve
     """
+    import torch
+
     from grr_torch.experiments.devices import measure_devices
     from grr_torch.experiments.timing import machine
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
 
-    if json_file is not None:
-        check_writable(json_file)
+    check_outputs({"--json": json_file})
     with progress_bar() as progress:
         results = measure_devices(
-            device or ("cpu", "cuda"),
+            device or (("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)),
             work=only,
             solves=solves,
             samples=samples,

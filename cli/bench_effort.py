@@ -31,10 +31,9 @@ def effort(
     """
     from grr_torch.experiments.effort import measure_effort
     from grr_torch.experiments.timing import machine
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
 
-    if json_file is not None:
-        check_writable(json_file)
+    check_outputs({"--json": json_file})
     with progress_bar() as progress:
         results = measure_effort(draws, robots=robot, tasks=task, progress=progress)
     if json_file is not None:

@@ -43,7 +43,7 @@ def learning(
     from grr_torch.experiments.learning import LABELS, compare_warm_starts, measure_learning
     from grr_torch.experiments.timing import machine
     from grr_torch.learning.options import TrainingOptions
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
     from grr_torch.resolution.build import build
     from grr_torch.resolution.roadmap import Roadmap
     from grr_torch.robots.load import load_robot
@@ -52,8 +52,7 @@ def learning(
     if not names:
         raise ParameterError("--labels", repr(labels), f"some of {', '.join(LABELS)}")
     options = TrainingOptions(samples=samples, epochs=epochs, seed=seed)
-    if json_file is not None:
-        check_writable(json_file)
+    check_outputs({"--json": json_file}, [file])
     with progress_bar() as progress:
         roadmap = Roadmap.load(file) if file else build(load_robot("kinova"), "fixed-rotation", progress=progress)
         outcomes = measure_learning(

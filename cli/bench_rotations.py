@@ -34,10 +34,9 @@ def rotations(
     """
     from grr_torch.experiments.rotations import measure_rotations
     from grr_torch.experiments.timing import machine
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
 
-    if json_file is not None:
-        check_writable(json_file)
+    check_outputs({"--json": json_file})
     with progress_bar() as progress:
         results = measure_rotations(
             problem,

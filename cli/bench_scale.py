@@ -51,13 +51,11 @@ def scale(
     from grr_torch.experiments.scale import SIZES, exponents, measure_scale
     from grr_torch.experiments.scale import plot as draw
     from grr_torch.experiments.timing import machine
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
 
     if plot is not None and plot.suffix != ".png":
         raise ParameterError("--plot", plot, "a file that ends in .png")
-    for file in (plot, json_file):
-        if file is not None:
-            check_writable(file)
+    check_outputs({"--plot": plot, "--json": json_file})
     with progress_bar() as progress:
         rows = measure_scale(robot, task, sizes=points or SIZES, refine=refine, repeats=repeats, progress=progress)
     powers = exponents(rows)

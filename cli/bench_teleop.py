@@ -48,7 +48,7 @@ def teleop(
     from grr_torch.experiments.paths import KINDS, read_paths
     from grr_torch.experiments.teleoperation import aggregate, run_teleoperation, save_trajectories
     from grr_torch.experiments.timing import machine
-    from grr_torch.output import check_writable
+    from grr_torch.output import check_outputs
     from grr_torch.resolution.build import build
     from grr_torch.resolution.roadmap import Roadmap
     from grr_torch.robots.load import load_robot
@@ -59,9 +59,7 @@ def teleop(
     if out is not None:
         if out.suffix != ".npz":
             raise ParameterError("--out", out, "a file that ends in .npz")
-        if out.resolve() in {path.resolve() for path in (file, paths) if path is not None}:
-            raise ParameterError("--out", out, "another file than those that are read")
-        check_writable(out)
+        check_outputs({"--out": out}, [file, paths])
     with progress_bar() as progress:
         roadmap = Roadmap.load(file) if file else build(load_robot("kinova"), "fixed-rotation", progress=progress)
         given = None if paths is None else read_paths(paths, roadmap.task.width)

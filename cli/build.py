@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from grr_torch.cli.show import ENGINES, print_json, print_rows, progress_bar, quality_rows, reports_errors
+from grr_torch.cli.show import ENGINES, numbers, print_json, print_rows, progress_bar, quality_rows, reports_errors
 
 from grr_torch.errors import ParameterError, UnknownNameError
 
@@ -65,7 +65,7 @@ def build(
         str | None, typer.Option(help="Bounds of the grid, in metres.", metavar="X0 X1 Y0 Y1 [Z0 Z1]")
     ] = None,
     rotation: Annotated[
-        tuple[float, float, float] | None,
+        str | None,
         typer.Option(
             help="Fixed-axis roll, pitch, yaw of the tool in radians, for fixed-rotation, and for yaw at yaw 0; 0 0 0 "
             "without a preset.",
@@ -73,7 +73,7 @@ def build(
         ),
     ] = None,
     axis: Annotated[
-        tuple[float, float, float] | None,
+        str | None,
         typer.Option(
             help="For yaw, what the tool turns about, in the base frame; for axis, the tool's axis, in its own; 0 0 1.",
             metavar="X Y Z",
@@ -108,7 +108,7 @@ def build(
     Example: grr-torch build --robot arm.urdf --tool flange --task position --points 2000
     --bounds -0.8 0.8 -0.8 0.8 0 1.2 --seeds seeds.csv
     """
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
     from grr_torch.resolution.auto_seeds import CANDIDATES
     from grr_torch.resolution.build import build as build_roadmap
     from grr_torch.resolution.problem import pose_problem
@@ -130,15 +130,12 @@ def build(
         )
         progress("loading the robot", 1, 1)
         out = out or Path(f"{Path(robot).stem}.grr")
-        _keep_inputs(out, record, [robot, seeds, spheres])
-        check_writable(out)
-        recording = None if no_record else record or out.with_suffix(".rrd")
-        if recording is not None:
-            check_writable(recording)
-            if recording.resolve() == out.resolve():
-                raise ParameterError("--record", recording, f"another file than the roadmap's, {out}")
+        recording = None if no_record else record or out.parent / f"{out.stem}.rrd"
+        check_outputs({"--out": out, "--record": recording}, [robot, seeds, spheres])
         box = None if bounds is None else _bounds(bounds)
-        problem = pose_problem(arm, _task(arm, task, box, rotation, axis), points, box, _seeds(arm, seeds), rotations)
+        turned = None if rotation is None else numbers("--rotation", rotation, ("roll", "pitch", "yaw"))
+        turning = None if axis is None else numbers("--axis", axis, ("x", "y", "z"))
+        problem = pose_problem(arm, _task(arm, task, box, turned, turning), points, box, _seeds(arm, seeds), rotations)
         weights = _weights(objective or [])
         progress.foretell(
             build_stages(
@@ -238,20 +235,12 @@ def _seeds(arm: Any, seeds: str | None) -> Any:
     return read_seeds(seeds)
 
 
-def _keep_inputs(out: Path, record: Path | None, inputs: Sequence[str | Path | None]) -> None:
-    """Refuses to write over what is read."""
-    given = {Path(path).resolve() for path in inputs if path is not None and Path(path).is_file()}
-    for name, path in (("--out", out), ("--record", record)):
-        if path is not None and path.resolve() in given:
-            raise ParameterError(name, path, "another file than those that are read")
-
-
 def _task(
     arm: Any,
     kind: str | None,
     box: list[tuple[float, float]] | None,
-    rotation: tuple[float, float, float] | None,
-    axis: tuple[float, float, float] | None,
+    rotation: list[float] | None,
+    axis: list[float] | None,
 ) -> Any:
     """The task space that the options and the preset say."""
     from grr_torch.resolution.problem import complete_task
@@ -263,12 +252,12 @@ def _task(
 
 def _bounds(text: str) -> list[tuple[float, float]]:
     try:
-        numbers = [float(value) for value in text.replace(",", " ").split()]
+        values = [float(value) for value in text.replace(",", " ").split()]
     except ValueError:
-        numbers = []
-    if len(numbers) not in (4, 6):
+        values = []
+    if len(values) not in (4, 6):
         raise ParameterError("--bounds", repr(text), "four or six numbers: x0 x1 y0 y1 [z0 z1]")
-    return list(zip(numbers[::2], numbers[1::2], strict=True))
+    return list(zip(values[::2], values[1::2], strict=True))
 
 
 def _weights(items: list[str]) -> dict[str, float]:

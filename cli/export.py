@@ -8,8 +8,6 @@ from typing import Annotated
 import typer
 from grr_torch.cli.show import print_json, print_rows, progress_bar, reports_errors
 
-from grr_torch.errors import ParameterError
-
 
 @reports_errors
 def export(
@@ -42,11 +40,11 @@ def export(
     """
     from grr_torch.learning.export import check_dataset_path, export_dataset
     from grr_torch.learning.split import Split
+    from grr_torch.output import check_outputs
     from grr_torch.resolution.roadmap import Roadmap
 
     parts = Split(split, validation, test, block, seed)
-    if out.resolve() == file.resolve():
-        raise ParameterError("--out", out, "another file than the one that is read")
+    check_outputs({"--out": out}, [file])
     check_dataset_path("--out", out)
     roadmap = Roadmap.load(file, device=device)
     with progress_bar() as progress:

@@ -27,15 +27,15 @@ def export_ik(
     """
     from grr_torch.learning.neural_ik import load_network
     from grr_torch.learning.onnx import export_onnx, export_torch
-    from grr_torch.output import check_writable
+    from grr_torch.output import check_outputs
 
+    check_outputs({"--onnx": onnx, "--torch": torch_export}, [weights])
     given = [(name, path) for name, path in ((".onnx", onnx), (".pt2", torch_export)) if path is not None]
     if not given:
         raise ParameterError("--onnx and --torch", "neither", "at least one of them")
     for suffix, path in given:
         if path.suffix.lower() != suffix:
             raise ParameterError("output", path, f"a file that ends in {suffix}")
-        check_writable(path)
     network, origin = load_network(weights)
     rows = []
     for suffix, path in given:

@@ -82,8 +82,9 @@ def run(arguments: Sequence[str] | None = None) -> None:
     app(join_bounds(list(sys.argv[1:] if arguments is None else arguments)), prog_name="grr-torch")
 
 
-# options that take as many numbers as follow
-_OF_NUMBERS = ("--bounds", "--point", "--start", "--goal", "--start-configuration", "--goal-configuration")
+# options that take as many numbers as follow, first those of commands that take no file beside options
+_WITHOUT_FILE = ("--bounds", "--rotation", "--axis")
+_OF_NUMBERS = (*_WITHOUT_FILE, "--point", "--start", "--goal", "--start-configuration", "--goal-configuration")
 # what a file's name has in it, and no number
 _FILE = re.compile(r"[/\s]|\.[A-Za-z]\w*$")
 
@@ -101,9 +102,9 @@ def join_bounds(arguments: list[str]) -> list[str]:
         words: list[str] = []
         if option in _OF_NUMBERS:
             words = list(itertools.takewhile(_may_be_a_number, arguments[position:]))
-            # after as many numbers, a word may be the file's name, unless there is one or none is taken
-            wrong = len(words) > 1 and [_is_a_number(word) for word in words] == [True] * (len(words) - 1) + [False]
-            if wrong and option != "--bounds" and not any(map(_FILE.search, arguments)) and words[-1][0].isalpha():
+            # after numbers, the last word may be the file's name, unless there is one or none is taken
+            named = option in _WITHOUT_FILE or any(map(_FILE.search, arguments))
+            if not named and len(words) > 1 and all(map(_is_a_number, words[:-1])) and words[-1][0].isalpha():
                 words.pop()
             position += len(words)
         joined.append(f"{option}={' '.join(words)}" if words else option)

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from grr_torch.cli.show import numbers, print_json, print_rows, reports_errors
 
-from grr_torch.errors import ParameterError
-
 if TYPE_CHECKING:
     from grr_torch.applications.path import Path
     from grr_torch.resolution.roadmap import Roadmap
@@ -48,17 +46,14 @@ def plan(
     Example: grr-torch plan kinova.grr --start 0.4 -0.3 0.2 --goal 0.4 0.3 0.4 --smooth --out path.csv --record path.rrd
     """
     from grr_torch.applications.path import save_path
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
     from grr_torch.recording.plan import record_plan
     from grr_torch.resolution.roadmap import Roadmap
     from grr_torch.tables import check_suffix
 
-    _check_files(file, out, record)
     if out is not None:
         check_suffix("--out", out)
-    for target in (out, record):
-        if target is not None:
-            check_writable(target)
+    check_outputs({"--out": out, "--record": record}, [file])
     roadmap = Roadmap.load(file)
     axes, joints = roadmap.task.coordinates, roadmap.robot.joint_names
     path = roadmap.plan(
@@ -81,15 +76,6 @@ def plan(
     _show(roadmap, path, [str(target) for target in (out, record) if target is not None], as_json)
     if not path.found:
         raise typer.Exit(1)
-
-
-def _check_files(file: FilePath, out: FilePath | None, record: FilePath | None) -> None:
-    given = {file.resolve()}
-    for name, path in (("--out", out), ("--record", record)):
-        if path is not None and path.resolve() in given:
-            raise ParameterError(name, path, "a file of its own")
-        if path is not None:
-            given.add(path.resolve())
 
 
 def _tensor(option: str, text: str | None, names: tuple[str, ...]) -> Any:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from grr_torch.cli.show import markdown_table, print_json, progress_bar, reports_errors
+from grr_torch.cli.show import markdown_table, numbers, print_json, progress_bar, reports_errors
 
 from grr_torch.errors import ParameterError
 
@@ -40,7 +40,7 @@ def smm(
         str | None, typer.Option(help="position, fixed-rotation, yaw, axis or pose; the preset's default.")
     ] = None,
     rotation: Annotated[
-        tuple[float, float, float] | None,
+        str | None,
         typer.Option(help="Fixed-axis roll, pitch, yaw of the tool in radians; the preset's.", metavar="R P Y"),
     ] = None,
     roadmap: Annotated[
@@ -64,20 +64,17 @@ def smm(
     Example: grr-torch smm --robot planar_3 --record illustration.rrd
     """
     from grr_torch.applications.self_motion import roadmap_choice, self_motion_manifold
-    from grr_torch.output import atomic_write, check_writable
+    from grr_torch.output import atomic_write, check_outputs
     from grr_torch.recording.self_motion import record_self_motion
     from grr_torch.robots.load import load_robot
 
-    for path in (record, out):
-        if path is not None:
-            check_writable(path)
-    if record is not None and out is not None and record.resolve() == out.resolve():
-        raise ParameterError("--out", out, "another file than the recording's")
+    check_outputs({"--record": record, "--out": out}, [roadmap, robot, spheres])
     with progress_bar() as progress:
         given = None if robot is None else load_robot(robot, tool=tool, base=base, spheres=spheres)
-        graph = _roadmap(roadmap, given, task, rotation, bool(point), progress)
+        turned = None if rotation is None else numbers("--rotation", rotation, ("roll", "pitch", "yaw"))
+        graph = _roadmap(roadmap, given, task, turned, bool(point), progress)
         places = _triangle(graph) if graph is not None and not point else [_numbers(text) for text in point or []]
-        arm, space = (graph.robot, graph.task) if graph else (given, _task(given, places, task, rotation))
+        arm, space = (graph.robot, graph.task) if graph else (given, _task(given, places, task, turned))
         assert arm is not None
         manifolds = [
             self_motion_manifold(arm, space, place, samples=samples, step=step, seed=seed, progress=progress)
@@ -104,7 +101,7 @@ def _roadmap(
     path: Path | None,
     arm: Robot | None,
     kind: str | None,
-    rotation: tuple[float, float, float] | None,
+    rotation: list[float] | None,
     has_points: bool,
     progress: Any,
 ) -> Roadmap | None:
@@ -118,7 +115,7 @@ def _roadmap(
             raise ParameterError("--robot", arm.name, f"{graph.robot.name}, the roadmap's, or none")
         if kind not in (None, graph.task.kind):
             raise ParameterError("--task", kind, f"{graph.task.kind}, the roadmap's, or none")
-        if rotation is not None and list(rotation) != graph.task.to_json().get("rotation"):
+        if rotation is not None and rotation != graph.task.to_json().get("rotation"):
             raise ParameterError("--rotation", rotation, "the roadmap's, or none")
         return graph
     if arm is None:

@@ -51,7 +51,7 @@ def solve(
     import numpy as np
 
     from grr_torch.applications.solve_table import solve_table
-    from grr_torch.output import check_writable
+    from grr_torch.output import check_outputs
     from grr_torch.resolution.roadmap import Roadmap
     from grr_torch.tables import check_suffix, read_points
 
@@ -61,9 +61,7 @@ def solve(
         raise ParameterError("--out", "nothing", "a file for the solutions of --points")
     if out is not None:
         check_suffix("--out", out)
-        if out.resolve() in {path.resolve() for path in (file, points) if path is not None}:
-            raise ParameterError("--out", out, "another file than those that are read")
-        check_writable(out)
+        check_outputs({"--out": out}, [file, points])
     roadmap = Roadmap.load(file, device=device)
     width, axes = roadmap.task.width, roadmap.task.coordinates
     places = np.array([numbers("--point", text, axes) for text in point or []]).reshape(-1, width)

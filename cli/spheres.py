@@ -8,8 +8,6 @@ from typing import Annotated
 import typer
 from grr_torch.cli.show import print_json, progress_bar, reports_errors
 
-from grr_torch.errors import ParameterError
-
 
 @reports_errors
 def spheres(
@@ -36,15 +34,13 @@ def spheres(
 
     Example: grr-torch spheres arm.urdf --out arm_spheres.yaml --spheres 20
     """
-    from grr_torch.output import check_writable
+    from grr_torch.output import check_outputs
     from grr_torch.robots.contact_pairs import find_pairs
     from grr_torch.robots.fit_spheres import DEFAULT_COUNT, fit_spheres
     from grr_torch.robots.read_urdf import read_urdf
     from grr_torch.robots.spheres import SphereModel
 
-    if out.resolve() == urdf.resolve():
-        raise ParameterError("--out", out, "another file than the URDF")
-    check_writable(out)
+    check_outputs({"--out": out}, [urdf])
     robot = read_urdf(urdf, package_dir or ())
     with progress_bar() as progress:
         fits = fit_spheres(robot, count=count, tolerance=tolerance, starts=starts, seed=seed, progress=progress)

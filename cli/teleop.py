@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from grr_torch.cli.show import print_json, print_rows, progress_bar, reports_errors
 
-from grr_torch.errors import ParameterError
-
 if TYPE_CHECKING:
     from grr_torch.applications.teleoperation_log import Summary, TeleoperationLog
     from grr_torch.resolution.roadmap import Roadmap
@@ -54,19 +52,12 @@ def teleop(
     Example: grr-torch teleop kinova.grr --path circle --out circle.csv
     """
     from grr_torch.applications.teleoperation_log import check_trajectory_path
-    from grr_torch.output import check_writable
+    from grr_torch.output import check_outputs
     from grr_torch.resolution.roadmap import Roadmap
 
     if out is not None:
         check_trajectory_path(out)
-    inputs = [file.resolve(), *([Path(path).resolve()] if path else [])]
-    for written in (record, out):
-        if written is not None:
-            if written.resolve() in inputs:
-                raise ParameterError("--record and --out", written, "other files than those that are read")
-            check_writable(written)
-    if record is not None and out is not None and record.resolve() == out.resolve():
-        raise ParameterError("--out", out, "another file than the recording's")
+    check_outputs({"--record": record, "--out": out}, [file, path])
     roadmap = Roadmap.load(file)
     limits = {"max_step": max_step, "acceleration_limits": acceleration}
     log = _replay(roadmap, path, rate, limits) if path else _interact(roadmap, rate, limits, host, port)

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from grr_torch.cli.show import print_json, print_rows, progress_bar, reports_errors
 
-from grr_torch.errors import ParameterError
-
 if TYPE_CHECKING:
     from grr_torch.learning.options import Epoch
 
@@ -50,6 +48,7 @@ def train_ik(
     from grr_torch.learning.split import Split
     from grr_torch.learning.train import check_weights_path
     from grr_torch.learning.train import train_ik as train
+    from grr_torch.output import check_outputs
     from grr_torch.resolution.roadmap import Roadmap
 
     options = TrainingOptions(
@@ -62,8 +61,7 @@ def train_ik(
         split=Split(block=block, seed=seed),
         architecture=Architecture(width, depth),
     )
-    if out.resolve() == file.resolve():
-        raise ParameterError("--out", out, "another file than the one that is read")
+    check_outputs({"--out": out}, [file])
     check_weights_path("--out", out)
     roadmap = Roadmap.load(file, device=device)
     try:

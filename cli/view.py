@@ -18,12 +18,11 @@ def view(
 
     Example: grr-torch view kinova.grr
     """
-    from grr_torch.output import check_writable
+    from grr_torch.output import check_outputs
     from grr_torch.recording.roadmap import record_roadmap, show_roadmap
     from grr_torch.resolution.roadmap import Roadmap
 
-    if save is not None:
-        check_writable(save)
+    check_outputs({"--save": save}, [file])
     roadmap = Roadmap.load(file)
     if save is None:
         show_roadmap(roadmap)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from grr_torch.errors import OutputError
+from grr_torch.errors import OutputError, ParameterError
 
 # files that were not finished
 PARTIAL = ".*.partial.*"
@@ -32,6 +32,33 @@ def check_writable(path: str | os.PathLike[str]) -> None:
             pass
     except OSError as error:
         raise OutputError(path, str(error.strerror)) from error
+
+
+def check_outputs(
+    outputs: Mapping[str, str | os.PathLike[str] | None], inputs: Iterable[str | os.PathLike[str] | None] = ()
+) -> None:
+    """Finds out before the work starts whether files could be written, none over another or over one that is read.
+
+    Args:
+        outputs: Files to write, by the name of what asks for them; None for one that is not asked for.
+        inputs: Files that are read.
+
+    Raises:
+        ParameterError: A file is one of the inputs, or that of another name.
+        OutputError: It cannot be written.
+    """
+    read = {Path(path).resolve() for path in inputs if path is not None and Path(path).is_file()}
+    written: dict[Path, str] = {}
+    for name, path in outputs.items():
+        if path is None:
+            continue
+        place = Path(path).resolve()
+        if place in read:
+            raise ParameterError(name, path, "another file than those that are read")
+        if place in written:
+            raise ParameterError(name, path, f"another file than that of {written[place]}")
+        written[place] = name
+        check_writable(path)
 
 
 @contextmanager

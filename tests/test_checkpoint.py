@@ -270,7 +270,7 @@ def test_two_builds_do_not_share_a_folder(planar_5, tmp_path):
 
 
 def test_resume_needs_a_checkpoint(planar_5):
-    with pytest.raises(ParameterError, match="with a checkpoint to resume from"):
+    with pytest.raises(ParameterError, match=r"resume: got no checkpoint; valid: .*--checkpoint DIR"):
         grr_torch.build(planar_5, "position", points=100, resume=True)
 
 

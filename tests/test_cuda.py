@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import grr_torch
+from grr_torch.errors import ParameterError
 from grr_torch.learning.dataset import RoadmapDataset
 from grr_torch.learning.export import export_dataset
 from grr_torch.learning.neural_ik import NeuralIK
@@ -84,6 +85,12 @@ def test_roadmaps_of_turning_tools_are_as_good(robot, task, size):
     assert found.resolved_vertices == pytest.approx(expected.resolved_vertices, rel=0.01)
     assert found.connected_edges == pytest.approx(expected.connected_edges, rel=0.01)
     assert found.smoothness == pytest.approx(expected.smoothness, rel=0.02)
+
+
+def test_a_build_that_would_not_fit_the_gpu_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device=None: (100 << 20, 1 << 36))
+    with pytest.raises(ParameterError, match="on the GPU"):
+        grr_torch.build(grr_torch.load_robot("kinova", device="cuda"), "position", points=300_000)
 
 
 @pytest.fixture(scope="module")

@@ -39,6 +39,15 @@ def test_what_fits_unrefined_is_said(kinova, monkeypatch):
         grr_torch.build(kinova, "position", points=problem.graph)
 
 
+def test_larger_pieces_count_too(kinova):
+    problem = pose_problem(kinova, "position", 50_000)
+    wanted = estimate_memory(kinova, problem, True, 1.0)
+    memory._require(kinova, problem, True, wanted)
+    with pytest.raises(ParameterError, match=r"GiB on the GPU; valid: about .* vertices"):
+        memory._require(kinova, problem, True, wanted, 1 << 30, " on the GPU")
+    memory._require(kinova, problem, True, wanted + (1 << 30), 1 << 30, " on the GPU")
+
+
 def test_where_nothing_is_known_nothing_is_refused(planar_5, monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: None)
     assert len(grr_torch.build(planar_5, "position", points=50, refine=False).points) >= 50

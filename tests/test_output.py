@@ -6,8 +6,8 @@ import resource
 
 import pytest
 
-from grr_torch.errors import GrrError, OutputError
-from grr_torch.output import atomic_write
+from grr_torch.errors import GrrError, OutputError, ParameterError
+from grr_torch.output import atomic_write, check_outputs
 
 
 def interrupt(temporary, error):
@@ -28,6 +28,21 @@ def test_an_interrupted_write_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "f.txt") as temporary:
         interrupt(temporary, KeyboardInterrupt())
     assert not list(tmp_path.iterdir())
+
+
+def test_no_file_is_written_over_another(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    read = tmp_path / "read.txt"
+    read.touch()
+    (tmp_path / "link.txt").symlink_to(read)
+    check_outputs({"--out": tmp_path / "new.txt", "--record": None, "--json": "other.txt"}, [read, None, "no file"])
+    for same in (read, "read.txt", "./read.txt", "link.txt"):
+        with pytest.raises(ParameterError, match="--out: got .*; valid: another file than those that are read"):
+            check_outputs({"--out": same}, [read])
+    with pytest.raises(ParameterError, match="--json: got .*; valid: another file than that of --out"):
+        check_outputs({"--out": tmp_path / "new.txt", "--json": "new.txt"})
+    with pytest.raises(OutputError, match="it is a folder"):
+        check_outputs({"--out": tmp_path})
 
 
 def test_an_unwritable_output_is_a_clear_error(planar_roadmap, tmp_path):

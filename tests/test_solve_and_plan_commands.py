@@ -194,8 +194,8 @@ def bad_files(folder):
         ("plan r.grr --start 0.3 0 --goal 0 0.3 --velocity -1", "velocity_limits: got -1.0"),
         ("plan r.grr --start 0.3 0 --goal 0 0.3 --acceleration 0", "acceleration_limits: got 0.0"),
         ("plan r.grr --start 0.3 0 --goal 0 0.3 --out p.txt", "a file that ends in"),
-        ("plan r.grr --start 0.3 0 --goal 0 0.3 --record r.grr", "a file of its own"),
-        ("plan r.grr --start 0.3 0 --goal 0 0.3 --out p.csv --record p.csv", "a file of its own"),
+        ("plan r.grr --start 0.3 0 --goal 0 0.3 --record r.grr", "another file than those that are read"),
+        ("plan r.grr --start 0.3 0 --goal 0 0.3 --out p.csv --record p.csv", "another file than that of --out"),
         ("plan none.grr --start 0.3 0 --goal 0 0.3", "none.grr: is not a file"),
     ],
 )

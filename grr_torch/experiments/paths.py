@@ -83,7 +83,8 @@ def read_paths(path: str | os.PathLike[str], width: int) -> dict[str, Tensor]:
                 raise FileFormatError(path, "is no npz file with arrays in it")
             arrays = {name: np.asarray(file[name], dtype=np.float64) for name in file}
     except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise FileFormatError(path, f"cannot be read as npz: {error}") from error
+        reason = "it is none, or has objects in it" if "pickle" in str(error) else error
+        raise FileFormatError(path, f"cannot be read as npz: {reason}") from error
     for name, array in arrays.items():
         if name not in KINDS:
             raise UnknownNameError("kind of path", name, KINDS)

@@ -110,7 +110,7 @@ def build(
     }
     check_options(robot, problem.task, options)
     if resume and checkpoint is None:
-        raise ParameterError("resume", resume, "with a checkpoint to resume from")
+        raise ParameterError("resume", "no checkpoint", "with checkpoint (--checkpoint DIR), the folder to go on from")
     what = None if checkpoint is None else describe_build(robot, problem, options)
     with closing(Checkpoint(checkpoint, what, resume)) as kept:
         if kept.roadmap is not None:

@@ -23,29 +23,40 @@ _CONNECTED = {False: 20, True: 40}
 _MARGIN = 1.2
 # whatever the size: pieces that are worked on
 _LEAST = 64 << 20
+# and on a GPU, of an edge, as long as the pieces are not full: these are larger there. Fitted to 3,000 to 1,000,000
+# vertices on one
+_EDGE_ON_GPU, _PIECES_ON_GPU = 1536, 7 << 28
 # vertices of which it is tried how many can be resolved, and the starts of each
 _TRIED, _STARTS = 400, 4
 
 
 def require_memory(robot: Robot, problem: Problem, refine: bool) -> None:
-    """Checks that a build will fit the memory that is free.
+    """Checks that a build will fit the memory that is free, of the machine and, if it uses one, of the GPU.
 
     Raises:
         ParameterError: It will not.
     """
-    free = available_memory()
-    if free is None or estimate_memory(robot, problem, refine, 1.0) <= free:
+    _require(robot, problem, refine, available_memory())
+    if robot.device.type == "cuda":
+        pieces = min(_EDGE_ON_GPU * len(problem.graph.edges), _PIECES_ON_GPU)
+        _require(robot, problem, refine, _gpu_memory(robot.device), pieces, " on the GPU")
+
+
+def _require(robot: Robot, problem: Problem, refine: bool, free: int | None, pieces: int = 0, where: str = "") -> None:
+    """`require_memory` of one memory, where `pieces` are so many bytes larger than on the CPU."""
+    if free is None or estimate_memory(robot, problem, refine, 1.0) + pieces <= free:
         return
     share = _resolvable(robot, problem)
-    wanted = estimate_memory(robot, problem, refine, share)
+    least = _LEAST + pieces
+    wanted = estimate_memory(robot, problem, refine, share) + pieces
     if wanted <= free:
         return
     vertices = len(problem.graph.points)
-    fitting = int(vertices * max(free - _LEAST, 0) / (wanted - _LEAST))
+    fitting = int(vertices * max(free - least, 0) / (wanted - least))
     valid = f"about {fitting:,} vertices"
-    if refine and estimate_memory(robot, problem, False, share) <= free:
+    if refine and estimate_memory(robot, problem, False, share) + pieces <= free:
         valid += ", or no refinement"
-    what = f"{vertices:,} vertices, which would take about {_gibibytes(wanted)}"
+    what = f"{vertices:,} vertices, which would take about {_gibibytes(wanted)}{where}"
     raise ParameterError("points", what, f"{valid}, with the {_gibibytes(free)} that are free")
 
 
@@ -82,6 +93,12 @@ def _resolvable(robot: Robot, problem: Problem) -> float:
     points = problem.graph.points[tried]
     reached = from_random_starts(robot, problem.task, points, _STARTS, generator, DEFAULT_TOLERANCES)[1].any(1)
     return min(1.0, float(reached.double().mean()) + 0.05)
+
+
+def _gpu_memory(device: torch.device) -> int:
+    """Bytes that are free on a GPU, and those that torch holds there without need."""
+    held = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return int(torch.cuda.mem_get_info(device)[0]) + held
 
 
 def _system_memory() -> int | None:

@@ -46,6 +46,8 @@ def pose_problem(
         UnknownNameError: No such task or seeds.
         ParameterError: Something is missing, does not fit the robot, or lies beyond its reach.
     """
+    if not isinstance(robot, Robot):
+        raise ParameterError("robot", repr(robot), "a Robot, such as load_robot('kinova') gives")
     problem = _complete(robot, task, points, bounds, seeds, rotations)
     check_task(robot, problem.task)
     _check_reach(robot, problem.task, problem.graph, warn=not isinstance(points, TaskGraph))

@@ -71,8 +71,11 @@ def save_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
 
 
 def roadmap_hash(roadmap: Roadmap) -> str:
-    """SHA-256 over the tensors of a roadmap's file, by which others name the roadmap that they are made from."""
-    return tensors_hash(_tensors(roadmap))
+    """SHA-256 over the tensors of a roadmap's file, by which others name the roadmap that they are made from.
+
+    Which vertices are reachable, which a build only looks for if asked to, does not count.
+    """
+    return tensors_hash({name: tensor for name, tensor in _tensors(roadmap).items() if name != "reachable"})
 
 
 def solving_tables(roadmap: Roadmap) -> dict[str, Tensor]:
