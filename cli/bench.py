@@ -201,7 +201,7 @@ def _show_speed(table: SpeedTable) -> None:
 
 def _beside(row: Row) -> str:
     ratios = row.ratios()
-    return ", ".join(f"{name} {_figure(value)} ({ratios[name]:.1f}×)" for name, value in row.peers.items())
+    return ", ".join(f"{name} {_figure(value)} ({_figure(ratios[name])}×)" for name, value in row.peers.items())
 
 
 def _more(row: Row) -> str:
