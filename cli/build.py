@@ -131,7 +131,7 @@ def build(
         progress("loading the robot", 1, 1)
         out = out or Path(f"{Path(robot).stem}.grr")
         recording = None if no_record else record or out.parent / f"{out.stem}.rrd"
-        check_outputs({"--out": out, "--record": recording}, [robot, seeds, spheres])
+        check_outputs({"--out": out, "--record": recording}, [None if arm.preset else robot, seeds, spheres])
         box = None if bounds is None else _bounds(bounds)
         turned = None if rotation is None else numbers("--rotation", rotation, ("roll", "pitch", "yaw"))
         turning = None if axis is None else numbers("--axis", axis, ("x", "y", "z"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -86,7 +87,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
 _WITHOUT_FILE = ("--bounds", "--rotation", "--axis")
 _OF_NUMBERS = (*_WITHOUT_FILE, "--point", "--start", "--goal", "--start-configuration", "--goal-configuration")
 # what a file's name has in it, and no number
-_FILE = re.compile(r"[/\s]|\.[A-Za-z]\w*$")
+_FILE = re.compile(r"/|\.[A-Za-z]\w*$")
 
 
 def join_bounds(arguments: list[str]) -> list[str]:
@@ -101,19 +102,22 @@ def join_bounds(arguments: list[str]) -> list[str]:
         position += 1
         words: list[str] = []
         if option in _OF_NUMBERS:
-            words = list(itertools.takewhile(_may_be_a_number, arguments[position:]))
-            # after numbers, the last word may be the file's name, unless there is one or none is taken
-            named = option in _WITHOUT_FILE or any(map(_FILE.search, arguments))
-            if not named and len(words) > 1 and all(map(_is_a_number, words[:-1])) and words[-1][0].isalpha():
-                words.pop()
+            words = list(
+                itertools.takewhile(_is_no_option if option in _WITHOUT_FILE else _is_no_file, arguments[position:])
+            )
             position += len(words)
         joined.append(f"{option}={' '.join(words)}" if words else option)
     return joined
 
 
-def _may_be_a_number(word: str) -> bool:
-    """Whether a word is neither an option nor a file's name."""
-    return _is_a_number(word) or (not (word.startswith("-") and not word[1:2].isdigit()) and not _FILE.search(word))
+def _is_no_option(word: str) -> bool:
+    """Whether a word is none that starts another option, nor several numbers in one word."""
+    return not word.startswith("--") and " " not in word
+
+
+def _is_no_file(word: str) -> bool:
+    """Whether it is no option, and no file either."""
+    return _is_a_number(word) or (_is_no_option(word) and not _FILE.search(word) and not os.path.isfile(word))
 
 
 def _is_a_number(word: str) -> bool:

@@ -37,8 +37,8 @@ def reports_errors(command: Callable[P, R]) -> Callable[P, R]:
             raise typer.Exit(2) from error
         except (RuntimeError, MemoryError) as error:
             # torch's are RuntimeErrors; it is not imported here, where it may not be needed
-            full = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
-            if not full and "can't allocate memory" not in str(error):
+            signs = ("out of memory", "ALLOC_FAILED", "can't allocate memory")
+            if not isinstance(error, MemoryError) and not any(sign in str(error) for sign in signs):
                 raise
             given = (str(error).splitlines() or [type(error).__name__])[0]
             typer.secho(

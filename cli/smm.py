@@ -67,8 +67,9 @@ def smm(
     from grr_torch.output import atomic_write, check_outputs
     from grr_torch.recording.self_motion import record_self_motion
     from grr_torch.robots.load import load_robot
+    from grr_torch.robots.presets import robot_names
 
-    check_outputs({"--record": record, "--out": out}, [roadmap, robot, spheres])
+    check_outputs({"--record": record, "--out": out}, [roadmap, None if robot in robot_names() else robot, spheres])
     with progress_bar() as progress:
         given = None if robot is None else load_robot(robot, tool=tool, base=base, spheres=spheres)
         turned = None if rotation is None else numbers("--rotation", rotation, ("roll", "pitch", "yaw"))

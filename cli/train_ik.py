@@ -61,7 +61,7 @@ def train_ik(
         split=Split(block=block, seed=seed),
         architecture=Architecture(width, depth),
     )
-    check_outputs({"--out": out}, [file])
+    check_outputs({"--out": out, "the state kept beside --out": checkpoint_path(out)}, [file])
     check_weights_path("--out", out)
     roadmap = Roadmap.load(file, device=device)
     try:

@@ -47,12 +47,12 @@ def check_outputs(
         ParameterError: A file is one of the inputs, or that of another name.
         OutputError: It cannot be written.
     """
-    read = {Path(path).resolve() for path in inputs if path is not None and Path(path).is_file()}
-    written: dict[Path, str] = {}
+    read = {os.path.realpath(path) for path in inputs if path is not None and os.path.isfile(path)}
+    written: dict[str, str] = {}
     for name, path in outputs.items():
         if path is None:
             continue
-        place = Path(path).resolve()
+        place = os.path.realpath(path)
         if place in read:
             raise ParameterError(name, path, "another file than those that are read")
         if place in written:

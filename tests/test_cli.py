@@ -186,6 +186,9 @@ def test_spheres_are_fitted_and_used(box_arm, tmp_path):
         ("build --robot planar_5 --out .", "it is a folder"),
         ("build --robot planar_5 --task position --rotation 0 0 1", "none for the task 'position'"),
         ("build --robot kinova --rotation 0 3,14 0,2", "--rotation: got '0 3,14 0,2'; valid: 3 finite numbers"),
+        ("build --robot kinova --rotation 0 0 pi/2", "--rotation: got '0 0 pi/2'; valid: 3 finite numbers"),
+        ("build --robot kinova --rotation 0 0 -pi", "--rotation: got '0 0 -pi'; valid: 3 finite numbers"),
+        ("smm --robot planar_3 --point 0.1 y", "--point: got '0.1 y'"),
         ("build --robot kinova --rotation 0 3.14", "--rotation: got '0 3.14'; valid: 3 finite numbers: roll pitch yaw"),
         ("build --robot kinova --task axis --axis 0 z 1", "--axis: got '0 z 1'; valid: 3 finite numbers: x y z"),
         ("build --robot kinova --spheres words.csv", "is not a sphere file"),
@@ -308,7 +311,7 @@ def test_help_imports_nothing_heavy(tmp_path):
     assert result.stdout.strip() == "[]"
 
 
-def test_the_numbers_after_bounds_become_one_argument():
+def test_the_numbers_after_bounds_become_one_argument(tmp_path, monkeypatch):
     assert join_bounds(["build", "--bounds", "-1", "1", "-2e-1", ".5", "--points", "3"]) == [
         "build", "--bounds=-1 1 -2e-1 .5", "--points", "3",
     ]  # fmt: skip
@@ -318,3 +321,9 @@ def test_the_numbers_after_bounds_become_one_argument():
         "--smooth",
     ]
     assert join_bounds(["--bounds", "-1 1 0 2"]) == ["--bounds", "-1 1 0 2"]
+    assert join_bounds(["solve", "--point", "0.1", ""]) == ["solve", "--point=0.1 "]
+    # a map may have any name, once it is there
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rr").touch()
+    words = ["--start", "0.3", "0", "--goal", "0", "0.3", "rr", "--out", "p.csv"]
+    assert join_bounds(words) == ["--start=0.3 0", "--goal=0 0.3", "rr", "--out", "p.csv"]

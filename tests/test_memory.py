@@ -40,12 +40,18 @@ def test_what_fits_unrefined_is_said(kinova, monkeypatch):
 
 
 def test_larger_pieces_count_too(kinova):
-    problem = pose_problem(kinova, "position", 50_000)
+    problem = pose_problem(kinova, "position", 300_000)
+    pieces = min(memory._EDGE_ON_GPU * len(problem.graph.edges), memory._PIECES_ON_GPU)
     wanted = estimate_memory(kinova, problem, True, 1.0)
     memory._require(kinova, problem, True, wanted)
-    with pytest.raises(ParameterError, match=r"GiB on the GPU; valid: about .* vertices"):
-        memory._require(kinova, problem, True, wanted, 1 << 30, " on the GPU")
-    memory._require(kinova, problem, True, wanted + (1 << 30), 1 << 30, " on the GPU")
+    memory._require(kinova, problem, True, wanted + pieces, pieces, " on the GPU")
+    for free in (1 << 30, 7 << 28):
+        with pytest.raises(ParameterError, match="GiB on the GPU; valid: about") as caught:
+            memory._require(kinova, problem, True, free, pieces, " on the GPU")
+        fitting = int(caught.value.valid.split()[1].replace(",", ""))
+        smaller = pose_problem(kinova, "position", fitting)
+        taken = estimate_memory(kinova, smaller, True, 1.0) + memory._EDGE_ON_GPU * len(smaller.graph.edges)
+        assert 0.5 * free < taken < 1.3 * free
 
 
 def test_where_nothing_is_known_nothing_is_refused(planar_5, monkeypatch):

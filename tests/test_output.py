@@ -43,6 +43,9 @@ def test_no_file_is_written_over_another(tmp_path, monkeypatch):
         check_outputs({"--out": tmp_path / "new.txt", "--json": "new.txt"})
     with pytest.raises(OutputError, match="it is a folder"):
         check_outputs({"--out": tmp_path})
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    check_outputs({"--out": tmp_path / "f.txt", "--record": tmp_path / "a"}, [tmp_path / "b", 300 * "x"])
 
 
 def test_an_unwritable_output_is_a_clear_error(planar_roadmap, tmp_path):

@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 
 import grr_torch
 from grr_torch.errors import FileFormatError
+from grr_torch.resolution.roadmap_file import roadmap_hash
 from grr_torch.resolution.verify import verify_file
 from grr_torch.robots.urdf_json import urdf_from_json, urdf_to_json
 from grr_torch.tensor_file import read_tensors, tensor_hash, write_tensors
@@ -260,3 +261,12 @@ def test_networkx_gets_the_resolved_part(planar_roadmap):
     np.testing.assert_array_equal(graph.nodes[node]["configuration"], planar_roadmap.configurations[node].numpy())
     slopes = [data["configuration_distance"] / data["point_distance"] for *_, data in graph.edges(data=True)]
     assert np.mean(slopes) == pytest.approx(planar_roadmap.quality().smoothness)
+
+
+def test_maps_go_by_the_same_name_whether_or_not_they_know_what_is_reachable(planar_5):
+    plain, asked = (grr_torch.build(planar_5, "position", points=100, reachability=tries) for tries in (0, 5))
+    assert plain.reachable is None
+    assert asked.reachable is not None
+    assert roadmap_hash(plain) == roadmap_hash(asked)
+    other = grr_torch.build(planar_5, "position", points=100, refine=False)
+    assert roadmap_hash(other) != roadmap_hash(plain)

@@ -35,8 +35,8 @@ class Result:
     Attributes:
         work: What was done.
         device: Where.
-        seconds: How long it took: of roadmaps and of solving the median of several runs; of an export all of the first
-            run, of training the mean epoch.
+        seconds: How long it took: of roadmaps and of solving the median of several runs; of an export all of one run,
+            of training all of one by its epochs.
         outcome: Figures of what came out.
     """
 

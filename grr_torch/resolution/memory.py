@@ -47,12 +47,14 @@ def _require(robot: Robot, problem: Problem, refine: bool, free: int | None, pie
     if free is None or estimate_memory(robot, problem, refine, 1.0) + pieces <= free:
         return
     share = _resolvable(robot, problem)
-    least = _LEAST + pieces
     wanted = estimate_memory(robot, problem, refine, share) + pieces
     if wanted <= free:
         return
     vertices = len(problem.graph.points)
-    fitting = int(vertices * max(free - least, 0) / (wanted - least))
+    # pieces that are not full grow with the edges, full ones do not
+    growing = wanted - pieces - _LEAST
+    of_edges = _EDGE_ON_GPU * len(problem.graph.edges) if pieces else 0
+    fitting = int(vertices * max((free - _LEAST - pieces) / growing, max(free - _LEAST, 0) / (growing + of_edges)))
     valid = f"about {fitting:,} vertices"
     if refine and estimate_memory(robot, problem, False, share) + pieces <= free:
         valid += ", or no refinement"

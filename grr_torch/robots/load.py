@@ -136,7 +136,7 @@ def find_device(device: torch.device | str | None) -> torch.device:
     try:
         found = torch.device("cpu" if device is None else device)
         torch.zeros(1, device=found).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError, ImportError) as error:
+    except (RuntimeError, TypeError, AssertionError, NotImplementedError, ImportError) as error:
         available = "cpu, cuda" if torch.cuda.is_available() else "cpu (no CUDA device is available)"
         raise ParameterError("device", device, available) from error
     return found
