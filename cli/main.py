@@ -102,9 +102,8 @@ def join_bounds(arguments: list[str]) -> list[str]:
         position += 1
         words: list[str] = []
         if option in _OF_NUMBERS:
-            words = list(
-                itertools.takewhile(_is_no_option if option in _WITHOUT_FILE else _is_no_file, arguments[position:])
-            )
+            belongs = _is_no_option if option in _WITHOUT_FILE else _is_no_file
+            words = list(itertools.takewhile(belongs, arguments[position:]))
             position += len(words)
         joined.append(f"{option}={' '.join(words)}" if words else option)
     return joined

@@ -220,6 +220,7 @@ def test_spheres_are_fitted_and_used(box_arm, tmp_path):
         ("bench teleop --paths words.csv", "words.csv: cannot be read as npz: it is none, or has objects in it"),
         ("spheres none.urdf --out s.yaml", "none.urdf: cannot be read"),
         ("build", "Missing option"),
+        ("solve --point 0.1 0.3 rr", "Missing argument 'FILE.grr'"),
         ("bild", "No such command"),
     ],
 )

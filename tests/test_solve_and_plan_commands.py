@@ -151,7 +151,6 @@ def bad_files(folder):
         ("solve --point 0,2 0.3 r.grr", "--point: got '0,2 0.3'; valid: 2 finite numbers: x y"),
         ("solve --point 0.1 0.3m r.grr", "--point: got '0.1 0.3m'; valid: 2 finite numbers: x y"),
         ("solve --point -.1 0..3 r.grr", "--point: got '-.1 0..3'; valid: 2 finite numbers: x y"),
-        ("solve --point 0.1 0.3 rr", "Missing argument 'FILE.grr'"),
         ("solve r.grr --point -x 0.2", "--point: got '-x 0.2'; valid: 2 finite numbers: x y"),
         ("solve --point 0.1 0.3 3r.grr", "3r.grr: is not a file"),
         ("solve --point 0.1 0.3 2026/r.grr", "2026/r.grr: is not a file"),
