@@ -28,6 +28,8 @@ _WIDEST = 2.0
 _BRIDGED = 1.5
 # and it is looked into by so many bisections: what spans ε or more even in an eighth of the gap is a jump
 _BISECTIONS = 3
+# of fewer numbers, einsum takes longer to begin than to sum
+_FEW_ENTRIES = 300
 # of the longest step, so that what the projection adds seldom has to be cut off
 _SLACK = 0.98
 
@@ -261,4 +263,6 @@ class Follower:
 
 def norms(motion: Array) -> Array:
     """Norms (…,) over the last axis; a fifth of the time that numpy.linalg's function takes."""
-    return np.sqrt((motion * motion).sum(-1))
+    if motion.size < _FEW_ENTRIES:
+        return np.sqrt((motion * motion).sum(-1))
+    return np.sqrt(np.einsum("...k,...k->...", motion, motion))

@@ -1,7 +1,7 @@
 """`SphereKernel` for a few configurations on the CPU, in numpy.
 
-All spheres are placed at once, whether they are near or not: up to about a thousand configurations the cost is that
-of calls. Distances are those of `SphereKernel`.
+All spheres of a configuration are placed at once if any two links of it are near: up to about a thousand configurations
+the cost is that of calls. Distances are those of `SphereKernel`.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ class FewSpheres:
             centres[first] = pair.first[:, :3].numpy() / -2.0
             centres[second] = pair.second[:, :3].numpy()
         size = max(map(len, centres.values()))
-        # the centre of each link's bounding sphere, and of its spheres
-        self._centres = np.ones((len(centres), 1 + size, 4), kernel.bounds.numpy().dtype)
-        self._centres[:, :1] = kernel.bounds.numpy()
+        # the centre of each link's bounding sphere, and of it and the others
+        self._bounds = kernel.bounds.numpy()
+        self._centres = np.ones((len(centres), 1 + size, 4), self._bounds.dtype)
+        self._centres[:, :1] = self._bounds
         for link, own in centres.items():
             self._centres[link, 1:, :3] = own[_padded(len(own), size)]
         self._frames = kernel.frames.numpy()
@@ -45,23 +46,37 @@ class FewSpheres:
     @np.errstate(over="ignore", invalid="ignore")
     def collides(self, frames: Array, margin: float) -> NDArray[np.bool_]:
         """`SphereKernel.collides`: (N,) bool for frames (F, 4, 3, N)."""
-        links, width = len(self._frames), frames.shape[3]
-        placed = np.matmul(self._centres, frames[self._frames].reshape(links, 4, 3 * width))
-        placed = placed.reshape(links, self._centres.shape[1], 3, width)
-        apart = placed[self._first, 0] - placed[self._second, 0]
+        poses = frames[self._frames]
+        bounds = _place(self._bounds, poses)[:, 0]
+        apart = bounds[self._first] - bounds[self._second]
         near = ~((apart * apart).sum(1) >= np.square(self._bound_reach + margin))
-        pairs, columns = near.nonzero()
-        hit, limits = np.zeros(width, dtype=bool), np.square(self._reach + margin)
+        hit = near.any(0)
+        some = hit.nonzero()[0]
+        if len(some) == 0:
+            return hit
+        hit[some] = False
+        placed = _place(self._centres, poses[..., some])
+        pairs, columns = near[:, some].nonzero()
+        limits = np.square(self._reach + margin)
         at_once = max(1, _DISTANCES_AT_ONCE // self._reach[0].size)
         for start in range(0, len(pairs), at_once):
             which, column = pairs[start : start + at_once], columns[start : start + at_once]
             # relative to the first link, so that little is lost in the difference of squares
             near_to = placed[self._first[which], 0, :, column][:, None]
             a, b = (placed[side[which], 1:, :, column] - near_to for side in (self._first, self._second))
-            squared = (a * a).sum(2)[:, :, None] + (b * b).sum(2)[:, None] - 2.0 * np.matmul(a, b.transpose(0, 2, 1))
+            # to sum over so short an axis takes einsum a fifth of the time
+            squared = np.matmul(-2.0 * a, b.transpose(0, 2, 1))
+            squared += np.einsum("msk,msk->ms", a, a)[:, :, None]
+            squared += np.einsum("msk,msk->ms", b, b)[:, None]
             touching = ~(squared >= limits[which]).reshape(len(which), -1).all(1)
-            hit[column[touching]] = True
+            hit[some[column[touching]]] = True
         return hit
+
+
+def _place(centres: Array, poses: Array) -> Array:
+    """(L, S, 3, N) homogeneous centres (L, S, 4) of each link, placed by its poses (L, 4, 3, N)."""
+    links, width = len(poses), poses.shape[3]
+    return np.matmul(centres, poses.reshape(links, 4, 3 * width)).reshape(links, centres.shape[1], 3, width)
 
 
 def _padded(count: int, size: int) -> NDArray[np.int64]:
