@@ -78,7 +78,8 @@ def test_a_data_set_reads_back_with_names_units_and_hash(planar_roadmap, tmp_pat
     }
     assert about["roadmap_sha256"] == roadmap_hash(planar_roadmap)
     planar_roadmap.save(tmp_path / "r.grr")
-    assert about["roadmap_sha256"] == tensors_hash(read_file(tmp_path / "r.grr")[1])
+    tensors = read_file(tmp_path / "r.grr")[1]
+    assert about["roadmap_sha256"] == tensors_hash({name: tensors[name] for name in tensors if name != "reachable"})
     np.testing.assert_array_equal(Split(seed=4).of(planar_roadmap)(torch.from_numpy(points)), arrays["split"])
 
 
