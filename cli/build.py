@@ -133,9 +133,9 @@ def build(
         recording = None if no_record else record or out.parent / f"{out.stem}.rrd"
         check_outputs({"--out": out, "--record": recording}, [None if arm.preset else robot, seeds, spheres])
         box = None if bounds is None else _bounds(bounds)
-        turned = None if rotation is None else numbers("--rotation", rotation, ("roll", "pitch", "yaw"))
-        turning = None if axis is None else numbers("--axis", axis, ("x", "y", "z"))
-        problem = pose_problem(arm, _task(arm, task, box, turned, turning), points, box, _seeds(arm, seeds), rotations)
+        rpy = None if rotation is None else numbers("--rotation", rotation, ("roll", "pitch", "yaw"))
+        about = None if axis is None else numbers("--axis", axis, ("x", "y", "z"))
+        problem = pose_problem(arm, _task(arm, task, box, rpy, about), points, box, _seeds(arm, seeds), rotations)
         weights = _weights(objective or [])
         progress.foretell(
             build_stages(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -160,7 +161,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _task(
-    arm: Robot | None, places: list[list[float]], kind: str | None, rotation: tuple[float, float, float] | None
+    arm: Robot | None, places: list[list[float]], kind: str | None, rotation: Sequence[float] | None
 ) -> TaskSpace:
     """The task space that the options ask for, with the preset's rotation where none is given."""
     from grr_torch.spaces.task import FixedRotation, Pose, make_task
