@@ -163,6 +163,4 @@ def _train(path: Path, device: str, samples: int, epochs: int) -> Result:
     begin = time.perf_counter()
     record = train_ik(roadmap, options, dataset=dataset).origin.training
     seconds = (time.perf_counter() - begin) / epochs
-    return Result(
-        f"train an epoch of {samples:,} samples", device, seconds, {"mm after the last": record["millimetres"]}
-    )
+    return Result(f"train an epoch of {samples:,} samples", device, seconds, {"mm, best epoch": record["millimetres"]})
