@@ -15,7 +15,7 @@ from grr_torch.spaces.configuration import average, embed
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
-# of larger roadmaps, a tree on the CPU is as fast as all distances
+# all distances grow with the vertices, and a tree's look-ups hardly: larger roadmaps are left to the CPU
 MOST_VERTICES = 1 << 15
 # distances held at once: 256 MiB, and as much again while they are added up
 _AT_ONCE = 1 << 26
@@ -35,7 +35,7 @@ class ManyGuesses:
         """For the resolved vertices (S,) of a roadmap, whose longest edge is `radius` [m]."""
         d, device = roadmap.task.dimension, roadmap.robot.device
         self._d, self._radius, self._k = d, radius, min(NEIGHBOURS[d], len(vertices))
-        self._continuous = roadmap.robot.continuous.to(device)
+        self._continuous = roadmap.robot.continuous
         self._points = roadmap.points[vertices, :d].to(device)
         self._embedded = embed(roadmap.configurations[vertices].to(device, torch.float64), self._continuous)
         rank = torch.full((len(roadmap.points),), -1)
