@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -85,6 +86,15 @@ def test_what_cannot_be_reached_is_said_so(planar_pose):
     assert status[0] in ("too far", "not converged")
     assert status[1] == "outside"
     assert status[2] in ("solved", "uncertified")
+
+
+def test_poses_beside_a_broken_edge_are_uncertified(planar_pose):
+    first, second = planar_pose.edges[planar_pose.connected][60]
+    broken = (planar_pose.edges == torch.stack([first, second])).all(1)
+    beside = planar_pose.task.interpolate(planar_pose.points[first], planar_pose.points[second], 0.1)
+    assert str(planar_pose.solve(beside).status) == "solved"
+    spoilt = replace(planar_pose, connected=planar_pose.connected & ~broken)
+    assert str(spoilt.solve(beside).status) == "uncertified"
 
 
 def test_a_way_is_planned_that_turns(planar_pose):

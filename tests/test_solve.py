@@ -129,6 +129,22 @@ def test_points_in_uncertified_cells_say_so(kinova_roadmap):
     assert share > 0.9
 
 
+def test_points_beside_a_broken_edge_are_uncertified(roadmap):
+    """So are they in all that would be cells, were the edge not broken; far from it nothing changes."""
+    corners = roadmap.cells()[0].corners
+    centres = roadmap.points[corners].mean(1)
+    before = roadmap.solve(centres)
+    first, second = corners[(before.status == "solved").nonzero()[0][0]][:2]
+    broken = (roadmap.edges == torch.stack([first, second])).all(1)
+    after = dataclasses.replace(roadmap, connected=roadmap.connected & ~broken).solve(centres)
+    at_edge = torch.isin(corners, torch.stack([first, second])).sum(1) == 2
+    assert int(broken.sum()) == 1
+    assert bool(at_edge.any())
+    assert set(after.status[(at_edge & before.valid).numpy()]) == {"uncertified"}
+    away = (centres - roadmap.points[first]).norm(dim=1) > 2.0 * roadmap.longest_edge
+    assert (after.status == before.status)[away.numpy()].all()
+
+
 def test_random_graphs_solve_too(planar_5):
     graph = grr_torch.random_graph([(-0.9, 0.9), (-0.9, 0.9)], 250, k=8, generator=torch.Generator().manual_seed(0))
     roadmap = grr_torch.build(planar_5, "position", points=graph, refine=False)

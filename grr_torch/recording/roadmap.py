@@ -29,9 +29,9 @@ def record_roadmap(roadmap: Roadmap, path: str | os.PathLike[str]) -> None:
 
     On the timeline `wave` the expansion grows; on `tour` the arm moves along connected edges. Entities:
     `roadmap/by_joint/…` and `roadmap/clearance` colour the resolved vertices, `roadmap/connected`, `roadmap/broken`
-    and `roadmap/grid` are edges, `roadmap/cells/wound` and `roadmap/cells/spread` are triangles that are not certified
-    because of a winding or a spread above 1 rad, `roadmap/unresolved` are vertices that are reachable but have no
-    configuration.
+    and `roadmap/grid` are edges, `roadmap/cells/wound` are triangles with a winding, `roadmap/cells/spread` others that
+    are not certified because of a spread above 1 rad or a broken edge, `roadmap/unresolved` are vertices that are
+    reachable but have no configuration.
 
     Where rotation varies, the map is shown in the rotation in which most vertices are resolved.
 

@@ -17,6 +17,7 @@ from grr_torch.resolution.cells import Cells, measure_cells
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.quality import Quality, measure_quality
 from grr_torch.robots.robot import Robot
+from grr_torch.spaces.cliques import are_closed
 from grr_torch.spaces.graph import TaskGraph, find_lattice
 from grr_torch.spaces.product import find_product
 from grr_torch.spaces.task import TaskSpace
@@ -147,9 +148,18 @@ class Roadmap:
 
     @cached_property
     def uncertified(self) -> tuple[Tensor, Tensor]:
-        """Corners (C, 3) and (C, 4) of the triangles and faces that are not certified. Roadmap files hold them."""
-        triangles_, squares_ = self.cells()
-        return triangles_.corners[~triangles_.certified], squares_.corners[~squares_.certified]
+        """Corners (C, 3) and (C, 4) of the triangles and faces inside which the map may not be continuous.
+
+        They are the cells that are not certified, and what would be cells if none of its edges were broken. Roadmap
+        files hold them.
+        """
+        between = self.resolved[self.edges].all(1)
+        found: list[Tensor] = []
+        for cells, around in zip(self.cells(), (self.graph.triangles, self.graph.faces), strict=True):
+            corners = around(between) if bool((between & ~self.connected).any()) else cells.corners[:0]
+            broken = ~are_closed(corners, self.edges[self.connected], len(self.points))
+            found.append(torch.cat([cells.corners[~cells.certified], corners[broken]]))
+        return found[0], found[1]
 
     @cached_property
     def solver(self) -> Solver:
@@ -177,8 +187,8 @@ class Roadmap:
         in space the pyramid of a cell's centre and face) by their barycentric weights, polished to 1e-10. It is smooth
         inside a cell, and its gradients come from the implicit function theorem. It has no jump where cells meet whose
         edges are connected, but its derivative has. A joint whose limit is in the way is held there; where that begins,
-        the derivative jumps too. Only whole, certified cells are "solved" here; where a corner is missing or an edge
-        broken, valid points are "uncertified". Points that are not valid get no gradient: leave them out of a loss.
+        the derivative jumps too. Only whole, certified cells are "solved" here; where a corner is missing, valid
+        points are "uncertified" too. Points that are not valid get no gradient: leave them out of a loss.
 
         Args:
             points: (*batch, width) points [m]; one or a million.

@@ -34,13 +34,18 @@ def triangles(edges: Tensor, vertices: int) -> Tensor:
 
 def closed(corners: Tensor, edges: Tensor, vertices: int) -> Tensor:
     """Those of cycles, given by their corners (C, k) in order, all of whose sides are edges (E, 2), smaller first."""
+    return corners[are_closed(corners, edges, vertices)]
+
+
+def are_closed(corners: Tensor, edges: Tensor, vertices: int) -> Tensor:
+    """(C,) which of cycles, given as to `closed`, it keeps."""
     keys = (edges[:, 0] * vertices + edges[:, 1]).sort().values
-    found: list[Tensor] = [corners[:0]]
-    for part in corners.split(_AT_ONCE):
+    result = torch.zeros(len(corners), dtype=torch.bool)
+    for part, whole in zip(corners.split(_AT_ONCE), result.split(_AT_ONCE), strict=True):
         following = part.roll(-1, dims=1)
         wanted = torch.minimum(part, following) * vertices + torch.maximum(part, following)
-        found.append(part[_are_edges(keys, wanted).all(1)])
-    return torch.cat(found)
+        whole.copy_(_are_edges(keys, wanted).all(1))
+    return result
 
 
 def draw(count: int, most: int, seed: int = 0) -> Tensor:
