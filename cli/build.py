@@ -49,6 +49,10 @@ def build(
             metavar="NAME=WEIGHT",
         ),
     ] = None,
+    max_slope: Annotated[
+        float | None,
+        typer.Option(help="Leave out edges whose D_q / D_p is above this, in rad/m, and have info list them."),
+    ] = None,
     reachability: Annotated[
         int, typer.Option(help="Random starts per unresolved vertex, to tell which are reachable; 0: not measured.")
     ] = 0,
@@ -159,6 +163,7 @@ def build(
                 neighbours=neighbours,
                 refine=refine,
                 objectives=weights,
+                max_slope=max_slope,
                 reachability=reachability,
                 seed=seed,
                 checkpoint=checkpoint,

@@ -38,7 +38,7 @@ def info(
     Example: grr-torch info kinova.grr --verify
     """
     from grr_torch.errors import ParameterError
-    from grr_torch.resolution.quality import Quality, steep_edges
+    from grr_torch.resolution.quality import Quality, left_out_edges, steep_edges
     from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.roadmap_file import load_roadmap, read_file
     from grr_torch.resolution.verify import verify_file
@@ -52,7 +52,7 @@ def info(
     if verify:
         with progress_bar() as progress:
             checks = verify_file(file, progress=progress)
-    steep = steep_edges(roadmap, max_slope)
+    steep, left_out = steep_edges(roadmap, max_slope), left_out_edges(roadmap)
     passed = all(check.passed for check in checks)
     robot = roadmap.robot
     if as_json:
@@ -68,7 +68,7 @@ def info(
             "format_version": metadata["format_version"],
             "package_version": metadata.get("package_version"),
         }
-        data["steep"] = [roadmap.edges[edge].tolist() for edge in steep.tolist()]
+        data["steep"], data["left_out"] = (roadmap.edges[edges].tolist() for edges in (steep, left_out))
         if verify:
             data["verified"] = passed
             data["checks"] = {check.name: {"passed": check.passed, "detail": check.detail} for check in checks}
@@ -96,6 +96,10 @@ def info(
         print_rows(f"{file}: {robot.name}, {roadmap.task.kind}", rows)
         if len(steep):
             print_rows(f"{len(steep)} steep edges, the steepest first", _steep_rows(roadmap, steep[:_LISTED]))
+        if len(left_out):
+            limit = roadmap.parameters["max_slope"]
+            title = f"{len(left_out)} edges left out, steeper than {limit:g} rad/m, the steepest first"
+            print_rows(title, _steep_rows(roadmap, left_out[:_LISTED]))
         if checks:
             results = [(f"{'✓' if check.passed else '✗'} {check.name}", check.detail) for check in checks]
             print_rows("verified" if passed else "NOT verified", results)
@@ -120,13 +124,10 @@ def _turning(roadmap: Roadmap) -> list[tuple[str, str]]:
 def _steep_rows(roadmap: Roadmap, edges: Tensor) -> list[tuple[str, str]]:
     from grr_torch.resolution.quality import edge_slopes
 
-    slopes = dict(zip(roadmap.connected.nonzero()[:, 0].tolist(), edge_slopes(roadmap).tolist(), strict=True))
-
     def place(vertex: int) -> str:
         return "(" + ", ".join(f"{value:.3f}" for value in roadmap.points[vertex].tolist()) + ")"
 
     return [
-        (f"{a} – {b}", f"{slopes[edge]:.1f} rad/m between {place(a)} and {place(b)} m")
-        for edge in edges.tolist()
-        for a, b in [roadmap.edges[edge].tolist()]
+        (f"{a} – {b}", f"{slope:.1f} rad/m between {place(a)} and {place(b)} m")
+        for (a, b), slope in zip(roadmap.edges[edges].tolist(), edge_slopes(roadmap, edges).tolist(), strict=True)
     ]

@@ -22,6 +22,7 @@ from grr_torch.resolution.expand import default_neighbours, expand
 from grr_torch.resolution.memory import require_memory
 from grr_torch.resolution.options import check_options, describe_build
 from grr_torch.resolution.problem import Problem, pose_problem
+from grr_torch.resolution.quality import without_steep_edges
 from grr_torch.resolution.random_grr import random_grr
 from grr_torch.resolution.reachability import measure_reachability
 from grr_torch.resolution.refine import refine as refine_roadmap
@@ -47,6 +48,7 @@ def build(
     samples: int = 100,
     refine: bool = True,
     objectives: Mapping[str, float] | None = None,
+    max_slope: float | None = None,
     reachability: int = 0,
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,
@@ -76,6 +78,8 @@ def build(
         refine: Whether the roadmap is repaired, relaxed and certified after the expansion.
         objectives: Weights of "clearance", "manipulability" and "limits", which refinement serves besides smoothness;
             at weight 1, 1 % of an objective's mean is worth 1 % of smoothness.
+        max_slope: Edges with D_q / D_p above this [rad/m] are not connected in the end, though continuous: there small
+            moves of the hand are large ones of the arm. No bound by default.
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. On the CPU the same inputs give the same tensors.
         tolerances: When a configuration counts as being at a point.
@@ -104,6 +108,7 @@ def build(
         "samples": samples,
         "refine": refine,
         "objectives": dict(objectives or {}),
+        "max_slope": max_slope,
         "reachability": reachability,
         "seed": seed,
         "tolerances": asdict(tolerances),
@@ -128,6 +133,7 @@ def build(
         settings = {
             "margin": robot.margin,
             "seed": seed,
+            "max_slope": max_slope,
             "reachability": reachability,
             "tolerances": asdict(tolerances),
         }
@@ -137,6 +143,8 @@ def build(
             roadmap = refine_roadmap(
                 roadmap, objectives=objectives, seed=seed, check=check, progress=progress, checkpoint=kept
             )
+        else:
+            roadmap = without_steep_edges(roadmap)
         if reachability:
             roadmap = _with_reachability(roadmap, tolerances, progress, kept)
         if kept.folder is not None:

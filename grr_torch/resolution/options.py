@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -50,6 +51,9 @@ def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> 
         raise ParameterError("objectives", tuple(objectives), "none without refinement, which serves them")
     if not 0 <= reachability <= _MOST_STARTS:
         raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
+    max_slope = options["max_slope"]
+    if max_slope is not None and not 0.0 < max_slope < math.inf:
+        raise ParameterError("max_slope", max_slope, "above 0 and finite, in rad/m")
     if method not in METHODS:
         raise UnknownNameError("method", method, METHODS)
     check_candidates(options["candidates"])

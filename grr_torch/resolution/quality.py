@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -145,6 +145,31 @@ def steep_edges(roadmap: Roadmap, max_slope: float | None = None) -> Tensor:
     return roadmap.connected.nonzero()[:, 0][steep[slopes[steep].argsort(descending=True)]]
 
 
+def left_out_edges(roadmap: Roadmap) -> Tensor:
+    """Indices (K,) of edges that are not connected because they are steeper than what the roadmap was built with.
+
+    Steeper than its `max_slope`, that is; the steepest first, and none if it has no such bound. Some of them may
+    not be continuous either.
+    """
+    limit = roadmap.parameters.get("max_slope")
+    if limit is None:
+        return torch.empty(0, dtype=torch.long)
+    edges = (roadmap.resolved[roadmap.edges].all(1) & ~roadmap.connected).nonzero()[:, 0]
+    slopes = edge_slopes(roadmap, edges)
+    order = slopes.argsort(descending=True)
+    return edges[order[slopes[order] > limit]]
+
+
+def without_steep_edges(roadmap: Roadmap) -> Roadmap:
+    """The roadmap whose edges steeper than its parameter `max_slope` [rad/m], if it has one, are not connected."""
+    limit = roadmap.parameters.get("max_slope")
+    if limit is None:
+        return roadmap
+    connected = roadmap.connected.clone()
+    connected[steep_edges(roadmap, limit)] = False
+    return replace(roadmap, connected=connected)
+
+
 def _count_cells(roadmap: Roadmap, progress: Progress) -> dict[str, Any]:
     counts: dict[str, Any] = {}
     for name, cells in zip(("triangles", "squares"), roadmap.cells(progress), strict=True):
@@ -155,9 +180,12 @@ def _count_cells(roadmap: Roadmap, progress: Progress) -> dict[str, Any]:
     return counts
 
 
-def edge_slopes(roadmap: Roadmap) -> Tensor:
-    """D_q / D_p (E_q,) of the connected edges [rad/m]."""
-    first, second = roadmap.edges[roadmap.connected].T
+def edge_slopes(roadmap: Roadmap, edges: Tensor | None = None) -> Tensor:
+    """D_q / D_p (K,) of edges between resolved vertices [rad/m], (E,) bool or their indices; by default the connected.
+
+    Where D_q and D_p are distances of joint and of task space (Section IV-B of the paper).
+    """
+    first, second = roadmap.edges[roadmap.connected if edges is None else edges].T
     q, points = roadmap.configurations, roadmap.points
     moved = distance(q[first], q[second], roadmap.robot.continuous.cpu())
     return moved / roadmap.task.distance(points[first], points[second])

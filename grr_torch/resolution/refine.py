@@ -16,7 +16,7 @@ from grr_torch.resolution.certify import certify
 from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.edges import EdgeCheck
 from grr_torch.resolution.objectives import Objective, check_objectives, measure_objective
-from grr_torch.resolution.quality import edge_slopes
+from grr_torch.resolution.quality import edge_slopes, without_steep_edges
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.resolution.repair import repair
 from grr_torch.resolution.report import before_refinement
@@ -40,7 +40,8 @@ def refine(
     Unresolved vertices and the ends of broken edges are tried again from all their neighbours and from random starts;
     then all configurations move along their self-motion manifolds at once. No vertex and no connected edge is lost:
     where the relaxed map breaks an edge, its ends go back part of the way, or to where they were. With objectives, the
-    smoothest map is then relaxed once more, for the sum that `grr_torch.resolution.objectives` gives.
+    smoothest map is then relaxed once more, for the sum that `grr_torch.resolution.objectives` gives. At last, edges
+    steeper than the roadmap's parameter `max_slope`, if it has one, are left out.
 
     Args:
         roadmap: The roadmap.
@@ -75,11 +76,8 @@ def refine(
             name: {"weight": weight, "before": _figures(smoothest, name), "after": _figures(refined, name)}
             for name, weight in weights.items()
         }
-    return replace(
-        refined,
-        parameters={**roadmap.parameters, "refinement": told},
-        build_seconds=roadmap.build_seconds + seconds,
-    )
+    parameters = {**roadmap.parameters, "refinement": told}
+    return without_steep_edges(replace(refined, parameters=parameters, build_seconds=roadmap.build_seconds + seconds))
 
 
 def _figures(roadmap: Roadmap, objective: str) -> dict[str, float | None]:

@@ -16,7 +16,7 @@ from grr_torch.errors import UrdfError
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.edges import check_edges
-from grr_torch.resolution.quality import quality_differences
+from grr_torch.resolution.quality import quality_differences, without_steep_edges
 from grr_torch.resolution.roadmap_file import load_roadmap, metadata_hash, read_file, solving_tables
 from grr_torch.robots.read_urdf import parse_urdf
 from grr_torch.robots.urdf_json import urdf_to_json
@@ -70,7 +70,7 @@ def verify_file(path: str | os.PathLike[str], *, progress: Progress = silent) ->
     if not math.isclose(roadmap.longest_edge, metadata["longest_edge"], rel_tol=1e-9):
         tables.append("longest_edge")
     position, rotation = quality.max_position_error or 0.0, quality.max_rotation_error or 0.0
-    found = check_edges(roadmap, tolerances, progress)
+    found = without_steep_edges(replace(roadmap, connected=check_edges(roadmap, tolerances, progress))).connected
     changed = int((found != roadmap.connected).sum())
     return [
         *checks,

@@ -1,0 +1,93 @@
+"""Slopes of edges: which are steep, and what is left out of a map that has a bound."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import grr_torch
+from grr_torch.errors import ParameterError
+from grr_torch.resolution.quality import edge_slopes, left_out_edges, steep_edges
+from grr_torch.resolution.refine import refine
+from grr_torch.resolution.verify import verify_file
+from grr_torch.spaces.configuration import distance
+
+BOUNDS = {"planar_5": 12.0, "kinova": 5.0}
+
+
+@pytest.fixture(scope="module", params=["planar_5", "kinova"])
+def pair(request) -> tuple[grr_torch.Roadmap, grr_torch.Roadmap]:
+    """The same problem without a bound and with one, not refined and refined."""
+    robot = grr_torch.load_robot(request.param)
+    options = {"points": 400, "refine": request.param == "kinova"}
+    return tuple(
+        grr_torch.build(robot, "position", **options, max_slope=bound) for bound in (None, BOUNDS[request.param])
+    )
+
+
+def test_only_edges_above_the_bound_are_left_out(pair):
+    free, bounded = pair
+    bound = BOUNDS[free.robot.name]
+    assert torch.equal(free.configurations[free.resolved], bounded.configurations[free.resolved])
+    slopes = edge_slopes(free)
+    above = torch.zeros_like(free.connected)
+    above[free.connected.nonzero()[:, 0][slopes > bound]] = True
+    assert bool(above.any())
+    assert torch.equal(bounded.connected, free.connected & ~above)
+    assert bounded.quality().smoothness_max <= bound < free.quality().smoothness_max
+    left_out = left_out_edges(bounded)
+    assert set(above.nonzero()[:, 0].tolist()) <= set(left_out.tolist())
+    assert bool((edge_slopes(bounded, left_out).diff() <= 0.0).all())
+    assert len(left_out_edges(free)) == 0
+
+
+def test_slopes_are_those_of_their_edges(pair):
+    free, _ = pair
+    between = free.resolved[free.edges].all(1)
+    a, b = free.edges[between].T
+    moved = distance(free.configurations[a], free.configurations[b], free.robot.continuous)
+    assert torch.allclose(edge_slopes(free, between), moved / (free.points[a] - free.points[b]).norm(dim=1))
+    steep = steep_edges(free, 3.0)
+    assert bool((edge_slopes(free, steep) > 3.0).all())
+
+
+def test_a_file_with_a_bound_is_verified_by_it(pair, tmp_path):
+    _, bounded = pair
+    bounded.save(tmp_path / "m.grr")
+    assert all(check.passed for check in verify_file(tmp_path / "m.grr"))
+    connected = bounded.connected.clone()
+    connected[left_out_edges(bounded)[0]] = True
+    replace(bounded, connected=connected).save(tmp_path / "spoilt.grr")
+    failed = {check.name for check in verify_file(tmp_path / "spoilt.grr") if not check.passed}
+    assert failed == {"edges"}
+
+
+def test_refining_again_keeps_the_bound(pair):
+    _, bounded = pair
+    again = refine(bounded)
+    assert again.quality().smoothness_max <= again.parameters["max_slope"] == BOUNDS[bounded.robot.name]
+
+
+@pytest.mark.parametrize("bound", [0.0, -1.0, math.nan, math.inf])
+def test_a_bound_is_a_positive_number(planar_5, bound):
+    with pytest.raises(ParameterError, match="max_slope"):
+        grr_torch.build(planar_5, "position", points=50, max_slope=bound)
+
+
+def test_the_commands_take_a_bound_and_list_what_is_left_out(run_cli):
+    command = run_cli
+    code, _, _ = command(
+        *("build", "--robot", "planar_5", "--task", "position", "--points", 400, "--no-refine"),
+        *("--max-slope", BOUNDS["planar_5"], "--out", "m.grr", "--no-record"),
+    )
+    assert code == 0
+    code, out, _ = command("info", "m.grr", "--verify")
+    assert code == 0
+    count = len(left_out_edges(grr_torch.Roadmap.load("m.grr")))
+    assert f"{count} edges left out, steeper than 12 rad/m" in out
+    code, _, error = command("build", "--robot", "planar_5", "--max-slope", 0)
+    assert code == 2
+    assert "max_slope: got 0" in error
