@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,8 +21,8 @@ def teleop(
     path: Annotated[
         str | None,
         typer.Option(
-            help="Replay circle, line or a FILE of waypoints (.csv, .npy or .parquet: one a row and control step, in "
-            "metres) without a browser.",
+            help="Replay circle, line or a FILE of waypoints (.csv, .npy or .parquet: one a row and control step, as "
+            "the roadmap's points: metres, and where rotation varies radians or unit vectors) without a browser.",
             metavar="circle|line|FILE",
         ),
     ] = None,
@@ -123,6 +124,7 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
     shares = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in summary.shares.items() if share)
     clearance = "not checked: no sphere model" if summary.clearance is None else f"{1e3 * summary.clearance:.1f} mm"
     deviations = (summary.deviation, summary.largest_deviation, summary.final_deviation)
+    turns = [math.degrees(t) for t in (summary.turn, summary.largest_turn, summary.final_turn) if t is not None]
     return [
         ("status", shares),
         ("time", f"{summary.seconds:.2f} s; a step takes {summary.step_milliseconds:.2f} ms (median)"),
@@ -130,4 +132,5 @@ def _rows(summary: Summary) -> list[tuple[str, str]]:
         ("longest stall", f"{summary.stall:.2f} s"),
         ("smallest clearance", clearance),
         ("from tool to target: mean, largest, last", ", ".join(f"{1e3 * value:.2f}" for value in deviations) + " mm"),
+        *([("turned: mean, largest, last", ", ".join(f"{value:.2f}" for value in turns) + "°")] if turns else []),
     ]

@@ -101,11 +101,23 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(words, complaint, tmp_path,
     assert not list(tmp_path.iterdir())
 
 
-def test_teleoperation_says_that_it_does_not_turn(built):
-    for path in ("circle", "line"):
-        code, output = run("teleop", built[0] / "map.grr", "--path", path)
-        assert code == 2
-        assert "rotation is not teleoperated" in output
+@pytest.mark.parametrize("path", ["circle", "line"])
+def test_a_path_is_replayed_and_recorded(built, path, tmp_path):
+    words = ("--path", path, "--record", tmp_path / "t.rrd", "--out", tmp_path / "t.npz", "--json")
+    code, output = run("teleop", built[0] / "map.grr", *words)
+    assert code == 0, output
+    summary = json.loads(output)
+    assert summary["shares"]["tracking"] > 0.9
+    assert summary["final_deviation"] < 1e-3
+    assert summary["final_turn"] < 1e-2
+    assert (tmp_path / "t.rrd").stat().st_size > 10_000
+    assert np.load(tmp_path / "t.npz")["targets"].shape[1] == 3
+
+
+def test_the_comparison_of_teleoperation_says_that_it_does_not_turn(built):
+    code, output = run("bench", "teleop", built[0] / "map.grr")
+    assert code == 2
+    assert "do not turn" in output
 
 
 def test_bench_prints_a_row_of_measured_figures(tmp_path):

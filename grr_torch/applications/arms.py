@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from grr_torch.applications.lines import Follower, norms
-from grr_torch.pieces import Array, Mask
+from grr_torch.applications.lines import Follower
+from grr_torch.pieces import Array, Mask, norms
 
 # rotation errors up to so many tolerances are made good on the way; with larger ones an arm is off its task
 _OFF_TASK = 10.0
@@ -34,6 +34,7 @@ class Arms:
         turn: Whether it is the turn of all arms to look for it.
         last_vertex: (B,) the last vertex of a route, and
         last_goal: (B, width) the goal it belongs to; NaN where there is none.
+        left_vertex: (B,) the vertex that the route led to before, −1 where there was none, and
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
         blind: (B,) steps for which an arm on a route follows it before it looks for a straight way to its target again.
         aimed: (B, width) the target for which it does so; a target elsewhere is looked for at once.
@@ -60,6 +61,7 @@ class Arms:
     turn: bool
     last_vertex: Array
     last_goal: Array
+    left_vertex: Array
     next_vertex: Array
     blind: Array
     aimed: Array
@@ -95,6 +97,7 @@ class Arms:
             turn=False,
             last_vertex=np.full(count, -1),
             last_goal=unknown(width),
+            left_vertex=np.full(count, -1),
             next_vertex=np.full(count, -1),
             blind=np.zeros(count, dtype=np.int64),
             aimed=unknown(width),
@@ -112,19 +115,16 @@ class Arms:
         """Finds out where the tools of some arms (A,) are, and whether these arms are on their task."""
         robot, task, q = follower.robot, follower.task, torch.from_numpy(self.q[which])
         position, rotation = robot.forward_kinematics(q)
-        points = position[:, : task.dimension]
-        error = task.error(points.T, position.T, rotation.permute(1, 2, 0))
+        columns = position.T, rotation.permute(1, 2, 0)
+        points = task.at(*columns)
+        error = task.error(points, *columns)
         turned = task.residuals(error)[1] <= _OFF_TASK * follower.tolerances.rotation
-        self.p[which] = points.numpy()
+        self.p[which] = points.T.numpy()
         self.on_task[which] = (turned & robot.within_limits(q) & ~robot.in_self_collision(q)).numpy()
 
     def holds(self, which: Array) -> Mask:
         """Whether arms (A,) have a point to hold at: (A,)."""
         return norms(self.held[which]) < np.inf
-
-    def barred_from(self, which: Array, targets: Array, distance: float) -> Mask:
-        """Whether arms (A,) have targets (A, width) within a distance [m] of those that they are barred from: (A,)."""
-        return norms(targets - self.barred[which]) <= distance
 
     def forget(self, which: Array) -> None:
         """Arms (A,) that have no more need of a route or a point to hold at."""

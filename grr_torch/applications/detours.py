@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from grr_torch.applications.arms import Arms
-from grr_torch.applications.lines import Follower, norms
+from grr_torch.applications.lines import Follower
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
 from grr_torch.pieces import Array, Mask
@@ -18,12 +18,12 @@ _ENTRIES = 6
 _ENDS = 8
 # of the latter, those that are tried first
 _LIKELY = 2
-# metres that a goal moves before the last vertex of the route to it is looked for again
-SAME_GOAL = 0.03
 # the most steps for which an arm on a route does not look for a straight way
 _MOST_DOUBT = 32
 # edges that an arm avoids before it gives a goal up
 _MOST_AVOIDED = 8
+# of the longest step: a shorter one along an edge that does not end there leads nowhere
+_ALL_BUT_ENDED = 0.05
 # an arm so near [rad or m] to a vertex's configuration is at the vertex
 _ARRIVED = 1e-6
 
@@ -36,7 +36,7 @@ class Detours:
 
     def set_goals(self, arms: Arms, which: Array, goals: Array, goals_q: Array) -> None:
         """Looks for the last vertices of arms' routes again, where the goals (A, width) have moved."""
-        moved = ~(norms(goals - arms.last_goal[which]) <= SAME_GOAL)
+        moved = ~self.follower.same_goal(goals, arms.last_goal[which])
         # whose straight way to the same goal came to nothing trusts the next one later, lest it goes to and fro
         again = arms.next_vertex[which] < 0
         longer = np.minimum(np.where(again, 2 * arms.doubt[which], arms.doubt[which]), _MOST_DOUBT)
@@ -72,21 +72,34 @@ class Detours:
                 self._enter(arms, which, result, left, tried)
         return result, left
 
-    def give_up_ended(self, arms: Arms, which: Array, steps: Array, targets: Array) -> None:
-        """Gives up routes that have come to nothing: the next configurations (A, n) of their arms are where they stand.
+    def give_up_ended(self, arms: Arms, which: Array, steps: Array, targets: Array) -> Mask:
+        """Gives up routes that have come to nothing: whose arms' next configurations (A, n) bring them no farther.
 
-        From a vertex whose next edge cannot be followed, another route is taken. Where there is no way on from the last
-        vertex, the arm is to go as near to its target (A, width) as it can.
+        Where the straight way along an edge, or on from a vertex, ends, another route is taken. Where there is none,
+        the arm is to go as near to its target (A, width) as it can.
+
+        Returns:
+            (A,) those that were given up.
         """
-        for row in (np.abs(steps - arms.q[which]).max(1) <= _ARRIVED).nonzero()[0].tolist():
+        share = (np.abs(steps - arms.q[which]) / self.follower.longest.numpy()).max(1)
+        heading = arms.next_vertex[which]
+        there = self.follower.distance(steps, self._placed[heading]) < _ARRIVED
+        ended = share <= np.where(there & (heading != arms.last_vertex[which]), _ARRIVED, _ALL_BUT_ENDED)
+        for row in ended.nonzero()[0].tolist():
             arm = int(which[row])
-            here, last = int(arms.next_vertex[arm]), int(arms.last_vertex[arm])
-            following = -1 if here < 0 else int(self.routes.towards(last, arms.avoided[arm])[1][here])
-            if here != last and following >= 0 and len(arms.avoided[arm]) < _MOST_AVOIDED:
-                arms.avoided[arm] |= {(here, following)}
+            edge = self._edge_ahead(arms, arm) if there[row] else (int(arms.left_vertex[arm]), int(heading[row]))
+            if min(edge) >= 0 and len(arms.avoided[arm]) < _MOST_AVOIDED:
+                arms.avoided[arm] |= {edge}
+                arms.next_vertex[arm] = heading[row] if there[row] else -1
             else:
                 arms.barred[arm] = targets[row]
             arms.blind[arm] = 0
+        return ended
+
+    def _edge_ahead(self, arms: Arms, arm: int) -> tuple[int, int]:
+        """The edge on which an arm at the next vertex of its route goes on; a negative vertex where there is none."""
+        here, last = int(arms.next_vertex[arm]), int(arms.last_vertex[arm])
+        return here, -1 if here == last else int(self.routes.towards(last, arms.avoided[arm])[1][here])
 
     def _arrived(self, arms: Arms, arm: int) -> bool:
         """Whether an arm is at the vertex that its route led to."""
@@ -115,8 +128,10 @@ class Detours:
             # of equal ways, the one that leads on
             best = mine[len(mine) - 1 - total[mine][::-1].argmin()]
             if total[best] < np.inf:
+                arm = which[row]
                 result[row], left[row] = lines.steps[best], False
-                arms.next_vertex[which[row]] = vertex[best]
+                if vertex[best] != arms.next_vertex[arm]:
+                    arms.left_vertex[arm], arms.next_vertex[arm] = arms.next_vertex[arm], vertex[best]
 
     def _last_vertices(self, goals: Array, goals_q: Array) -> Array:
         """Of the vertices round each goal that it is joined to by a continuous line, the one most like it.

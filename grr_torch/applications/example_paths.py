@@ -8,9 +8,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from grr_torch.applications.teleoperate import check_teleoperable
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.slices import fullest_slice
 from grr_torch.spaces.configuration import difference
 
 KINDS = ("circle", "line")
@@ -26,16 +26,17 @@ _APART = 0.4
 
 
 def middles(roadmap: Roadmap, count: int = 1) -> Tensor:
-    """The resolved vertices (count, width) that are deepest inside the roadmap, the deepest first [m].
+    """The resolved vertices (count, width) that are deepest inside the roadmap, the deepest first.
 
     Deep is what is far from unresolved vertices, from uncertified cells and from the roadmap's bounds. Of equally
-    deep ones, the first is nearest to the mean of all.
+    deep ones, the first is nearest to the mean of all. Where rotation varies, all are of one rotation, that in which
+    most vertices are resolved.
 
     Raises:
-        ParameterError: No vertex is resolved, or rotation varies.
+        ParameterError: No vertex is resolved.
     """
-    check_teleoperable(roadmap.task)
-    points = roadmap.points
+    roadmap = fullest_slice(roadmap)
+    points = roadmap.positions
     doubtful = ~roadmap.resolved
     for corners in roadmap.uncertified:
         doubtful[corners] = True
@@ -46,14 +47,16 @@ def middles(roadmap: Roadmap, count: int = 1) -> Tensor:
     if bool(doubtful.any()):
         depth = depth.minimum(torch.from_numpy(cKDTree(points[doubtful].numpy()).query(good.numpy())[0]))
     away = (good - good.mean(0)).norm(dim=1)
-    return good[(1e-3 * away - depth).argsort()[:count]]
+    chosen = good[(1e-3 * away - depth).argsort()[:count]]
+    rotation = roadmap.points[:1, roadmap.task.dimension :]
+    return torch.cat([chosen, rotation.expand(len(chosen), -1)], dim=1)
 
 
 def example_path(roadmap: Roadmap, kind: str, rate: float = 50.0) -> Tensor:
     """A large circle or line (N, width) on which the roadmap is continuous, one waypoint for each control step [m].
 
     A circle is horizontal and ends where it began, and so does a line: it goes there and back. The tool moves at
-    0.15 m/s. Circles round the base's axis are tried too.
+    0.15 m/s, and its rotation stays. Circles round the base's axis are tried too.
 
     Args:
         roadmap: The roadmap.
@@ -72,20 +75,21 @@ def example_path(roadmap: Roadmap, kind: str, rate: float = 50.0) -> Tensor:
     axis = centres[:1].clone()
     axis[:, :2] = 0.0
     centres = torch.cat([centres, axis])
-    half = 0.5 * float((roadmap.points[roadmap.resolved].amax(0) - roadmap.points[roadmap.resolved].amin(0)).max())
+    d, resolved = roadmap.task.dimension, roadmap.positions[roadmap.resolved]
+    half = 0.5 * float((resolved.amax(0) - resolved.amin(0)).max())
     sizes = half * torch.arange(_SIZES, 0, -1, dtype=torch.float64) / _SIZES
     largest = None
     for size in sizes.tolist():
         if largest is not None and size > _SHARE * largest:
             continue
-        tried = _circles(centres, size, _POINTS) if kind == "circle" else _lines(centres, size, _POINTS)
+        tried = _circles(centres, size, _POINTS) if kind == "circle" else _lines(centres, d, size, _POINTS)
         fits = _passable(roadmap, tried).nonzero()[:, 0]
         if largest is None and len(fits) and size > sizes[-1]:
             largest = size
         elif len(fits):
             length = 2.0 * math.pi * size if kind == "circle" else 4.0 * size
             count = max(8, round(length / _SPEED * rate)) + 1
-            drawn = _circles(centres, size, count) if kind == "circle" else _lines(centres, size, count)
+            drawn = _circles(centres, size, count) if kind == "circle" else _lines(centres, d, size, count)
             return drawn[fits[0]]
     raise ParameterError("path", kind, "one that fits into the roadmap; this roadmap is too small for it")
 
@@ -98,15 +102,15 @@ def _circles(centres: Tensor, radius: float, count: int) -> Tensor:
     return centres[:, None] + offsets
 
 
-def _lines(centres: Tensor, half: float, count: int) -> Tensor:
+def _lines(centres: Tensor, d: int, half: float, count: int) -> Tensor:
     """Lines (C · K, count, width) through centres (C, width) in K directions, from one end to the other and back."""
-    d = centres.shape[1]
     grid = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)] * d)
     # of each pair of opposite ones, the one that comes later in the order
     directions = torch.nn.functional.normalize(grid[len(grid) // 2 + 1 :], dim=1)
     there = torch.linspace(-1.0, 1.0, (count + 1) // 2, dtype=torch.float64)
     fractions = torch.cat([there, there.flip(0)[count % 2 :]])
     offsets = half * fractions[:, None] * directions[:, None]
+    offsets = torch.nn.functional.pad(offsets, (0, centres.shape[1] - d))
     return (centres[:, None, None] + offsets).flatten(0, 1)
 
 

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from grr_torch.applications.lines import Follower, norms
+from grr_torch.applications.lines import Follower
 from grr_torch.applications.solve import Solver
-from grr_torch.pieces import Array, Mask
+from grr_torch.pieces import Array, Mask, norms
+from grr_torch.spaces.task import TaskSpace
 
 # metres around the last such point that are searched in a step, and the share of it in steps that look closely
 _AROUND = 0.2
@@ -57,13 +58,12 @@ def nearest_feasible(
     Returns:
         Points (B, width), configurations (B, n), and which targets the map solves (B,).
     """
-    close = np.where(closely, _CLOSE, 1.0).astype(base.dtype)
-    apart = np.minimum(norms(targets - base), _AROUND) * close
-    around = base[:, None] + apart[:, None, None] * _directions(targets - base)
+    gap = follower.task.gap_of_few
+    around = _around(follower.task, base, targets, np.where(closely, _CLOSE, 1.0).astype(base.dtype))
     points = np.concatenate([base[:, None], around, targets[:, None]], axis=1)
     # as long as the arm can stay where it is, only what is nearer to the target can be better
     known = norms(base_q) < np.inf
-    left = norms(points - targets[:, None])
+    left = gap(points, targets[:, None])
     tried = (left < left[:, :1]) | ~known[:, None]
     tried[:, [0, -1]] = True
     solved = np.zeros_like(tried)
@@ -73,7 +73,7 @@ def nearest_feasible(
     stretched = np.zeros(tried.shape, base.dtype)
     stretched[tried] = np.nan_to_num(strayed)
     fits = solved & (stretched <= np.maximum(_STRETCHED, stretched[:, :1]))
-    reach = _SLOPE * norms(points - base[:, None]) + _LEAST
+    reach = _SLOPE * gap(points, base[:, None]) + _LEAST
     moved = np.where(known[:, None], follower.distance(q, np.nan_to_num(base_q)[:, None]), 0.0)
     fits &= moved <= reach
     score = np.where(fits, left + _WORTH * moved, np.inf)
@@ -81,17 +81,20 @@ def nearest_feasible(
     # a point that the map no longer solves is better than none
     kept = np.expand_dims(known & ~np.isfinite(score[rows, best]), 1)
     found, found_q = np.where(kept, base, points[rows, best]), np.where(kept, base_q, q[rows, best])
-    nearer, vertices = much_nearer(solver, found, targets)
+    nearer, vertices = much_nearer(follower, solver, found, targets)
     over = np.expand_dims(nearer | ~np.isfinite(found_q).all(1), 1)
     found = np.where(over, solver.points.numpy()[vertices], found)
     found_q = np.where(over, solver.configurations.numpy()[vertices], found_q)
     return found, found_q, solved[:, -1]
 
 
-def much_nearer(solver: Solver, points: Array, targets: Array) -> tuple[Mask, Array]:
+def much_nearer(follower: Follower, solver: Solver, points: Array, targets: Array) -> tuple[Mask, Array]:
     """Where a resolved vertex is much nearer to the target than a point (B, width), (B,), and the nearest one (B,)."""
     distances, vertices = (part[:, 0].numpy() for part in solver.nearest(torch.from_numpy(targets)))
-    return distances < _NEARER * norms(points - targets), vertices
+    task = follower.task
+    if task.rotations is not None:
+        distances = task.gap_of_few(solver.points.numpy()[vertices], targets)
+    return distances < _NEARER * task.gap_of_few(points, targets), vertices
 
 
 def _solve(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Mask, Array]:
@@ -102,6 +105,26 @@ def _solve(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Ma
     columns, codes = solver.solve_from(torch.from_numpy(points.T), guesses, codes, tolerances)
     q = columns.T.numpy()
     return q, codes.numpy() <= 1, follower.distance(q, guesses.numpy())
+
+
+def _around(task: TaskSpace, base: Array, targets: Array, close: Array) -> Array:
+    """Points (B, K, width) round others (B, width), towards targets and across, a share `close` (B,) of the usual way.
+
+    Where rotation varies, each is tried in the rotation that there is and in one nearer to the target's; and turning
+    on the spot is.
+    """
+    d = task.dimension
+    towards = (targets - base)[:, :d]
+    apart = np.minimum(norms(towards), _AROUND) * close
+    places = base[:, None, :d] + apart[:, None, None] * _directions(towards)
+    if task.rotations is None:
+        return places
+    share = close * np.minimum(_AROUND / np.maximum(task.gap_of_few(base, targets), 1e-12), 1.0)
+    turned = task.interpolate_few(base, targets, share[:, None])
+    places = np.concatenate([places, places, base[:, None, :d]], axis=1)
+    count = len(_LEANS) * (2 if d == 2 else _SIDES) + 1
+    rotations = np.repeat(np.stack([base[:, d:], turned[:, d:]], axis=1), [count, count + 1], axis=1)
+    return np.concatenate([places, rotations], axis=2).astype(base.dtype)
 
 
 def _directions(towards: Array) -> Array:

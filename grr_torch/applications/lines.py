@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import FEW, Array, Mask
+from grr_torch.pieces import FEW, Array, Mask, norms
 from grr_torch.projection.continuity import continuous_columns
 from grr_torch.projection.few import project_few
 from grr_torch.projection.project import Tolerances, project_columns
@@ -28,8 +28,8 @@ _WIDEST = 2.0
 _BRIDGED = 1.5
 # and it is looked into by so many bisections: what spans ε or more even in an eighth of the gap is a jump
 _BISECTIONS = 3
-# of fewer numbers, einsum takes longer to begin than to sum
-_FEW_ENTRIES = 300
+# points no farther apart than this [m] are the same goal
+_SAME_GOAL = 0.03
 # of the longest step, so that what the projection adds seldom has to be cut off
 _SLACK = 0.98
 
@@ -85,7 +85,7 @@ class Follower:
 
     Attributes:
         robot: The robot.
-        task: The task space; rotation does not vary in it.
+        task: The task space.
         tolerances: When a configuration counts as being at a point.
         longest: (n,) the most that a joint moves in a control step [rad or m].
     """
@@ -128,7 +128,7 @@ class Follower:
         aim = self._aim(q, motion, pace)
         rows = aim.looked.nonzero()[0]
         fraction = aim.fractions[aim.looked][:, None]
-        on_way = p[rows] + fraction * (targets - p)[rows]
+        on_way = self.task.interpolate_few(p[rows], targets[rows], fraction)
         starts = q[rows] + fraction * motion[rows]
         if offsets is not None:
             starts[np.cumsum(aim.looked.sum(1)) - 1] = guesses
@@ -139,7 +139,7 @@ class Follower:
         found[aim.looked], reached[aim.looked] = solved.T, valid
         found = np.where(aim.looked[..., None], found, found[:, -1:])
         reached = np.where(aim.looked, reached, reached[:, -1:])
-        after = np.where(aim.near[:, None], targets, p + aim.fractions[:, -2, None] * (targets - p))
+        after = np.where(aim.near[:, None], targets, self.task.interpolate_few(p, targets, aim.fractions[:, -2, None]))
         return self._judge(aim, found, reached, after, p, targets)
 
     def _projected(self, points: Array, guesses: Array) -> tuple[Array, Mask]:
@@ -167,6 +167,10 @@ class Follower:
         fractions[:, -1] = 1.0
         return _Aim(q, near, length, short, fractions, looked)
 
+    def same_goal(self, first: Array, second: Array) -> Mask:
+        """(B,) points (B, width) that are next to others: whoever is on the way to the one is to the other too."""
+        return self.task.gap_of_few(first, second) <= _SAME_GOAL
+
     def share(self, motion: Array) -> Array:
         """(B,) how much of motions (B, n) a step covers, a little less than it could; above 1 of short ones."""
         return _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
@@ -189,7 +193,7 @@ class Follower:
         bridged = direct[:, None] & wide
         if bridged.any():
             stops = np.concatenate([np.zeros_like(q[:, :1]), aim.fractions[:, :-2], np.ones_like(q[:, :1])], axis=1)
-            along = p[:, None] + np.minimum(stops, 1.0)[..., None] * (targets - p)[:, None]
+            along = self.task.interpolate_few(p[:, None], targets[:, None], np.minimum(stops, 1.0)[..., None])
             direct &= self._bridged(chain, along, bridged)
         return Lines(ends, steps, after, reached[:, -1], hit[:, -1] | ~reached[:, -1], safe, direct)
 
@@ -259,10 +263,3 @@ class Follower:
         """1 / 2π and 2π of continuous joints, (n,) each; 0 of others, whose differences stay as they are."""
         continuous = self.robot.continuous.numpy().astype(self._longest.dtype)
         return continuous / (2.0 * math.pi), continuous * (2.0 * math.pi)
-
-
-def norms(motion: Array) -> Array:
-    """Norms (…,) over the last axis; a fifth of the time that numpy.linalg's function takes."""
-    if motion.size < _FEW_ENTRIES:
-        return np.sqrt((motion * motion).sum(-1))
-    return np.sqrt(np.einsum("...k,...k->...", motion, motion))

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 
 from grr_torch.applications.arms import Arms
-from grr_torch.applications.detours import SAME_GOAL, Detours
+from grr_torch.applications.detours import Detours
 from grr_torch.applications.hold import much_nearer, nearest_feasible
-from grr_torch.applications.lines import Follower, Lines, norms
+from grr_torch.applications.lines import Follower, Lines
 from grr_torch.applications.rejoin import rejoin
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
 from grr_torch.applications.steps import HOLDING, TRACKING, UNREACHABLE, Steps
-from grr_torch.pieces import Array, Mask
+from grr_torch.pieces import Array, Mask, norms
 
 # vertices that are tried as a way back to the map
 _WAYS_BACK = 32
@@ -62,7 +62,7 @@ class Pilot:
         only follows the route; and points to hold at are searched for in every other step, of all arms at once.
         """
         on_route = (arms.next_vertex[which] >= 0) & arms.on_task[which]
-        blind = on_route & (arms.blind[which] > 0) & (norms(targets - arms.aimed[which]) <= SAME_GOAL)
+        blind = on_route & (arms.blind[which] > 0) & self.follower.same_goal(targets, arms.aimed[which])
         arms.blind[which[blind]] -= 1
         wanted = self._search(arms, which, targets, arms.holds(which) & ~blind)
         steps, ends = Steps.none_yet(arms, which), np.full_like(arms.q[which], np.nan)
@@ -84,13 +84,13 @@ class Pilot:
         Returns:
             (A,) the arms for which that was due in this step; some of them wait.
         """
-        leapt = ~(norms(targets - arms.sought[which]) <= SAME_GOAL)
+        leapt = ~self.follower.same_goal(targets, arms.sought[which])
         wanted = holding & (leapt | ~arms.searched[which])
         arms.turn = not arms.turn
         search = wanted & (leapt | arms.waited[which] | arms.turn)
         waits = (wanted & ~search).nonzero()[0]
         if len(waits):
-            search[waits] = much_nearer(self.solver, arms.held[which[waits]], targets[waits])[0]
+            search[waits] = much_nearer(self.follower, self.solver, arms.held[which[waits]], targets[waits])[0]
         arms.waited[which] = wanted & ~search
         if search.any():
             self._hold(arms, which[search], targets[search])
@@ -134,7 +134,7 @@ class Pilot:
         At the edge of a hole a target next to the tool often is one of a few steps that are on the other side of a
         self-motion, and the arm would turn round for them.
         """
-        near = (norms(targets - arms.p[which]) <= SAME_GOAL) & arms.on_task[which]
+        near = self.follower.same_goal(targets, arms.p[which]) & arms.on_task[which]
         waits = turned & near & (arms.next_vertex[which] < 0) & (arms.hesitated[which] < _HESITATION)
         arms.hesitated[which[waits]] += 1
         steps.points[waits], steps.codes[waits] = arms.p[which[waits]], HOLDING
@@ -163,7 +163,7 @@ class Pilot:
             goals = np.where(holding[:, None], arms.held[chosen], targets[rows])
             lines, found = self._lines(arms, chosen, goals, ends[rows], holding)
             free = (found | holding) & lines.direct & arms.on_task[chosen]
-            direct[rows], valid[rows] = free, found & (free | ~arms.barred_from(chosen, goals, SAME_GOAL))
+            direct[rows], valid[rows] = free, found & (free | ~self.follower.same_goal(goals, arms.barred[chosen]))
             ends[rows[~holding]] = lines.ends[~holding]
             steps.q[rows[free]], steps.goals[rows[free]] = lines.steps[free], lines.ends[free]
             steps.points[rows[free]] = lines.points[free]
@@ -175,7 +175,7 @@ class Pilot:
 
         Whatever the map's configuration there is now: near full stretch many are within the tolerance.
         """
-        there = norms(arms.held[which] - arms.p[which]) <= self.follower.tolerances.position
+        there = self.follower.task.gap_of_few(arms.held[which], arms.p[which]) <= self.follower.tolerances.position
         there &= self.follower.distance(arms.q[which], arms.held_q[which]) <= _NEAR
         return lost & there & arms.on_task[which]
 
@@ -184,7 +184,7 @@ class Pilot:
 
         Arms that are `lost` (A,) go to where they hold, in as many steps as are left for that.
         """
-        same = ~lost & (norms(goals - arms.offset_at[which]) <= SAME_GOAL)
+        same = ~lost & self.follower.same_goal(goals, arms.offset_at[which])
         offsets = np.where(same[:, None], arms.offsets[which], 0.0)
         pace = np.where(lost, 1.0 / arms.due[which], 1.0)
         arms.due[which] = np.maximum(arms.due[which] - 1, 1)
@@ -207,7 +207,7 @@ class Pilot:
         unset = ~arms.holds(which)
         base = np.where(unset[:, None], arms.p[which], arms.held[which])
         # what is not to be gone to by any route must not be where a jump leads
-        here = unset & arms.barred_from(which, targets, SAME_GOAL)
+        here = unset & self.follower.same_goal(targets, arms.barred[which])
         base_q = np.where(here[:, None], arms.q[which], arms.held_q[which])
         closely = arms.closely[which] & ~unset
         found = nearest_feasible(self.follower, self.solver, base, base_q, targets, closely)
@@ -228,7 +228,8 @@ class Pilot:
             chosen = which[rows]
             steps.q[rows], left[rows] = self.detours.follow(arms, chosen, (briefly | routed)[rows])
             found = rows[~left[rows] & routed[rows]]
-            self.detours.give_up_ended(arms, which[found], steps.q[found], targets[found])
+            ended = self.detours.give_up_ended(arms, which[found], steps.q[found], targets[found])
+            steps.codes[found[ended]] = HOLDING
         for row in (left & routed).nonzero()[0].tolist():
             step = self._back(arms, int(which[row]), ends[row])
             if step is None:

@@ -14,6 +14,7 @@ from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
 from grr_torch.errors import ParameterError
 from grr_torch.progress import Progress, silent
+from grr_torch.projection.project import tool_points
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.tables import read_points
 
@@ -22,7 +23,7 @@ _MORE_SECONDS, _ARRIVED = 2.0, 1e-3
 
 
 def read_waypoints(path: str | os.PathLike[str], width: int) -> Tensor:
-    """Waypoints (N, width) [m], one a row of a .csv, with or without a header, .npy or .parquet.
+    """Waypoints (N, width), one a row of a .csv, with or without a header, .npy or .parquet.
 
     Raises:
         ParameterError: The suffix is not known.
@@ -46,22 +47,23 @@ def replay(
 
     Args:
         roadmap: The roadmap.
-        waypoints: (N, width) targets [m].
+        waypoints: (N, width) targets.
         rate: Control steps in a second [Hz].
         max_step: As for `Teleoperator`.
         acceleration_limits: As for `Teleoperator`.
         progress: Told how many steps are done.
 
     Raises:
-        ParameterError: There is no waypoint, one is not finite, they are not of the task's width, or a parameter is
-            out of its range.
+        ParameterError: There is no waypoint, one is not finite or has a direction or quaternion of length zero,
+            they are not of the task's width, or a parameter is out of its range.
     """
     width = roadmap.task.width
     if waypoints.ndim != 2 or waypoints.shape[1] != width or len(waypoints) == 0:
         raise ParameterError("waypoints", tuple(waypoints.shape), f"(1 or more, {width})")
     if not bool(waypoints.isfinite().all()):
         raise ParameterError("waypoints", "NaN or infinite values", "finite values")
-    robot, d = roadmap.robot, roadmap.task.dimension
+    robot, task = roadmap.robot, roadmap.task
+    waypoints = task.unit(waypoints.to(torch.float64))
     teleoperator = Teleoperator(roadmap, rate, max_step=max_step, acceleration_limits=acceleration_limits)
     log = TeleoperationLog(roadmap, rate)
     total = len(waypoints) + round(_MORE_SECONDS * rate)
@@ -74,8 +76,8 @@ def replay(
         q = command.configuration
         clearance = float(robot.self_collision_distance(q)) - robot.margin
         log.append(Step(k / rate, tuple(target.tolist()), q, str(command.status), clearance, seconds))
-        tool = robot.forward_kinematics(q)[0][:d].cpu()
-        if k >= len(waypoints) - 1 and float((tool - target[:d]).norm()) <= _ARRIVED:
+        tool = tool_points(robot, task, q[None])[0].numpy()
+        if k >= len(waypoints) - 1 and float(task.gap_of_few(tool, target.to(q).numpy())) <= _ARRIVED:
             break
     progress("following", total, total)
     return log

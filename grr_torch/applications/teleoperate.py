@@ -12,15 +12,14 @@ from torch import Tensor
 
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.braking import limit_acceleration
-from grr_torch.applications.lines import Follower, norms
+from grr_torch.applications.lines import Follower
 from grr_torch.applications.pilot import Pilot
 from grr_torch.applications.retime import per_joint, usual_speeds
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.steps import HOLDING
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import Array, Mask, one_thread
+from grr_torch.pieces import Array, Mask, norms, one_thread
 from grr_torch.projection.project import Tolerances
-from grr_torch.spaces.task import TaskSpace
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -46,16 +45,6 @@ class Command:
 
     configuration: Tensor
     status: np.ndarray[Any, np.dtype[np.str_]]
-
-
-def check_teleoperable(task: TaskSpace) -> None:
-    """Checks that arms can be teleoperated in a task space.
-
-    Raises:
-        ParameterError: Rotation varies in it.
-    """
-    if task.rotations is not None:
-        raise ParameterError("task", task.kind, "position or fixed-rotation: rotation is not teleoperated")
 
 
 class Teleoperator:
@@ -91,15 +80,14 @@ class Teleoperator:
                 velocity limits over the rate, 1 rad/s or 1 m/s where it has none.
             acceleration_limits: Of the joints [rad/s² or m/s²], one number or (n,); by default none. An arm that has
                 them never moves so fast that it could not stop free of self-collision.
-            max_jump: A target farther from the last one than this [m] is refused, until `reset`.
+            max_jump: A target farther from the last one than this [m] is refused, until `reset`; where rotation
+                varies, a radian counts as 0.3 m.
             timeout: An input older than this [s] is refused; see `step`.
 
         Raises:
-            ParameterError: A parameter is out of its range, no vertex is resolved, the robot is not on the CPU, or
-                rotation varies in the task.
+            ParameterError: A parameter is out of its range, no vertex is resolved, or the robot is not on the CPU.
         """
         robot = roadmap.robot
-        check_teleoperable(roadmap.task)
         if robot.device.type != "cpu":
             raise ParameterError("device of the robot", str(robot.device), "cpu, where few arms are fastest")
         if not 0.0 < rate < math.inf:
@@ -151,7 +139,8 @@ class Teleoperator:
     def step(self, target: Tensor, time: float | None = None) -> Command:
         """One control step.
 
-        A target that is not finite, too far from the last one or too old is refused: the arm holds.
+        A target that is not finite, whose direction or quaternion has no length, that is too far from the last one or
+        too old is refused: the arm holds.
 
         Args:
             target: (*batch, width) points of the task space, one for each arm.
@@ -173,12 +162,15 @@ class Teleoperator:
         targets = target.detach().to(robot.lower).reshape(-1, task.width).numpy().copy()
         # targets beyond all numbers are only far away
         with torch.no_grad(), one_thread(), np.errstate(over="ignore", invalid="ignore"):
-            accepted: Mask = np.isfinite(targets).all(1) & self._in_time(time)
+            proper = self._normalise(targets)
+            accepted = proper & self._in_time(time)
             if self._arms is None:
+                if not proper.all():
+                    raise ParameterError("first target", "NaN, infinite or zero", "valid points: the arms start there")
                 self._start(target.shape[:-1], targets)
             if self._last is not None:
                 # comparison with NaN, where there was no target yet, is false
-                accepted &= ~(norms(targets - self._last) > self.max_jump)
+                accepted &= ~(task.gap_of_few(targets, self._last) > self.max_jump)
                 targets = np.where(accepted[:, None], targets, self._last)
             self._last = np.where(accepted[:, None], targets, np.nan) if self._last is None else targets
             return self._advance(accepted, targets)
@@ -207,13 +199,20 @@ class Teleoperator:
 
     def _start(self, batch: torch.Size, targets: Array) -> None:
         """Arms at their first targets."""
-        if not np.isfinite(targets).all():
-            raise ParameterError("first target", "NaN or infinite values", "finite values: the arms start there")
         solver, points = self.roadmap.solver, torch.from_numpy(targets)
         q, codes = solver.solve_columns(points.T.contiguous())
         vertices = solver.nearest(points)[1][:, 0]
         placed = torch.where((codes <= 1)[:, None], q.T, solver.configurations[vertices])
         self._batch, self._arms = batch, Arms.at(self._follower, placed.numpy())
+
+    def _normalise(self, targets: Array) -> Mask:
+        """Makes the rotations of targets (B, width) those that points have; which targets are proper ones (B,)."""
+        task = self.roadmap.task
+        proper: Mask = np.isfinite(targets).all(1)  # type: ignore[assignment]
+        if task.rotations is not None:
+            proper &= task.rotations.are_rotations(torch.from_numpy(targets[:, task.dimension :])).numpy()
+            targets[proper] = task.unit(torch.from_numpy(targets[proper])).numpy()
+        return proper
 
     def _in_time(self, time: float | None) -> bool:
         """Whether an input is younger than the time-out; the control clock advances."""

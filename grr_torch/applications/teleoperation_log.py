@@ -18,7 +18,7 @@ from grr_torch.errors import ParameterError
 from grr_torch.output import atomic_write
 from grr_torch.resolution.roadmap import Roadmap
 
-# an arm stalls when no joint moves more than this in a step [rad or m] though its tool is farther away than that [m]
+# an arm stalls when no joint moves more than this in a step [rad or m] though its tool has farther to go than that [m]
 STILL, AWAY = 1e-4, 0.01
 
 TRAJECTORY_SUFFIXES = (".csv", ".npy", ".npz")
@@ -30,7 +30,7 @@ class Step:
 
     Attributes:
         time: When it was, from the start [s].
-        target: (width,) the target [m].
+        target: (width,) the target.
         configuration: (n,) the configuration that was commanded, not wrapped [rad or m].
         status: Of `STATUSES`.
         clearance: Self-collision distance [m], the margin subtracted; inf without a sphere model.
@@ -54,12 +54,15 @@ class Summary:
         seconds: How long it took in the arm's time [s].
         shares: The share of steps with each status.
         joint_step: The most that a joint moved in a step [rad or m].
-        stall: The longest time for which no joint moved though the tool was more than 1 cm from its target [s];
-            also while the clutch was let go.
+        stall: The longest time for which no joint moved though the tool was more than 1 cm from its target [s], or
+            as good as that turned away; also while the clutch was let go.
         clearance: The smallest self-collision distance, the margin subtracted [m]; None without a sphere model.
         deviation: Mean distance of the tool from its target in the same step [m].
         largest_deviation: The largest such distance [m].
         final_deviation: That of the last step [m].
+        turn: Mean rotation of the tool from its target in the same step [rad]; None where rotation is free.
+        largest_turn: The largest such rotation [rad].
+        final_turn: That of the last step [rad].
         step_milliseconds: Median time to compute a step [ms].
     """
 
@@ -72,6 +75,9 @@ class Summary:
     deviation: float
     largest_deviation: float
     final_deviation: float
+    turn: float | None
+    largest_turn: float | None
+    final_turn: float | None
     step_milliseconds: float
 
     def to_dict(self) -> dict[str, Any]:
@@ -96,7 +102,7 @@ class TeleoperationLog:
         assert len(figures) == self._width
         self._rows.extend(figures)
         self._codes.append(STATUSES.tolist().index(step.status))
-        self.__dict__.pop("tools", None)
+        self.__dict__.pop("_poses", None)
 
     @property
     def times(self) -> Tensor:
@@ -115,7 +121,7 @@ class TeleoperationLog:
 
     @property
     def targets(self) -> Tensor:
-        """(T, width) targets [m]."""
+        """(T, width) targets."""
         return self._table()[:, 3 : 3 + self.roadmap.task.width]
 
     @property
@@ -128,16 +134,31 @@ class TeleoperationLog:
         """(T,) array of text: what `Command.status` says."""
         return STATUSES[np.array(self._codes[:], dtype=np.intp)]
 
-    @cached_property
+    @property
     def tools(self) -> Tensor:
         """(T, 3) where the tool was [m]."""
-        return self.roadmap.robot.forward_kinematics(self.configurations)[0].cpu()
+        return self._poses[0].T
 
     @property
     def deviations(self) -> Tensor:
         """(T,) distances of the tool from its target [m]."""
-        d = self.roadmap.task.dimension
-        return (self.tools[:, :d] - self.targets[:, :d]).norm(dim=1)
+        return self._residuals()[0]
+
+    @property
+    def turns(self) -> Tensor | None:
+        """(T,) rotations of the tool from its target [rad]; None where rotation is free."""
+        task = self.roadmap.task
+        return None if task.constraints == task.dimension else self._residuals()[1]
+
+    @cached_property
+    def _poses(self) -> tuple[Tensor, Tensor]:
+        """The tool's positions (3, T) and rotations (3, 3, T)."""
+        position, rotation = self.roadmap.robot.forward_kinematics(self.configurations)
+        return position.T.cpu(), rotation.permute(1, 2, 0).cpu()
+
+    def _residuals(self) -> tuple[Tensor, Tensor]:
+        task = self.roadmap.task
+        return task.residuals(task.error(self.targets.T, *self._poses))
 
     def summary(self) -> Summary:
         """Figures of the whole.
@@ -147,10 +168,11 @@ class TeleoperationLog:
         """
         if len(self) == 0:
             raise ParameterError("log", "no step", "at least one")
-        motion, deviations = self.configurations.diff(dim=0).abs().amax(1), self.deviations
-        clearance = float(self.clearances.min())
+        motion, deviations, turns = self.configurations.diff(dim=0).abs().amax(1), self.deviations, self.turns
+        clearance, task = float(self.clearances.min()), self.roadmap.task
         status = self.status
-        still = (motion <= STILL) & (deviations[1:] > AWAY)
+        away = task.gap_of_few(task.at(*self._poses).T.numpy(), self.targets.numpy()) > AWAY
+        still = (motion <= STILL) & torch.from_numpy(away[1:])
         return Summary(
             steps=len(self),
             seconds=float(self.times[-1]),
@@ -161,6 +183,9 @@ class TeleoperationLog:
             deviation=float(deviations.mean()),
             largest_deviation=float(deviations.max()),
             final_deviation=float(deviations[-1]),
+            turn=None if turns is None else float(turns.mean()),
+            largest_turn=None if turns is None else float(turns.max()),
+            final_turn=None if turns is None else float(turns[-1]),
             step_milliseconds=1e3 * float(self.step_seconds.median()),
         )
 

@@ -105,6 +105,8 @@ def run_teleoperation(
         ParameterError: Paths do not fit the roadmap.
         MissingPackageError: dtw-python is not installed.
     """
+    if roadmap.task.rotations is not None:
+        raise ParameterError("task", roadmap.task.kind, "position or fixed-rotation: the paths compared do not turn")
     warping()  # known before minutes have passed
     for method in methods:
         if method not in METHODS:

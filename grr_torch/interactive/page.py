@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import socket
 import time
 from collections.abc import Callable
@@ -11,6 +12,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
+from trimesh.geometry import align_vectors
 
 from grr_torch.applications.teleoperation_log import Step
 from grr_torch.errors import MissingPackageError, ParameterError
@@ -18,12 +21,16 @@ from grr_torch.interactive.scene import ArmView, MapView, TrailView
 from grr_torch.interactive.session import Session
 from grr_torch.recording import colours
 from grr_torch.recording.self_motion_view import in_space
+from grr_torch.spaces.rotation import matrix_from_quaternion, quaternion_from_matrix
+from grr_torch.spaces.task import Axis
 
 # the arm and the words on the page are renewed so often [s]
 _ARM_PERIOD, _WORDS_PERIOD = 1.0 / 30.0, 0.1
-_AXES = "xyz"
-# keys that move the target along an axis; the camera has the arrows and W A S D Q E
-_KEYS = (("L", "J"), ("I", "K"), ("U", "O"))
+# coordinates that have a slider, and the keys that move the target along them; the camera has the arrows and W A S D
+# Q E. Directions and quaternions have neither, but the handle turns
+_KEYS = {"x": ("L", "J"), "y": ("I", "K"), "z": ("U", "O"), "yaw": ("M", "N")}
+# what a key turns by [rad]
+_TURN = 0.05
 
 
 class Page:
@@ -83,19 +90,21 @@ class Page:
 
     def _add_handle(self) -> Any:
         """What is dragged."""
-        flat = self._session.roadmap.task.dimension == 2
+        task = self._session.roadmap.task
         handle = self._server.scene.add_transform_controls(
             "/target",
             scale=0.16 * self._size(),
             line_width=3.5,
-            active_axes=(True, True, not flat),
-            disable_rotations=True,
+            # in the plane it would have no ring to turn it by
+            active_axes=(True, True, task.dimension == 3 or task.rotations is not None),
+            disable_rotations=task.rotations is None,
             depth_test=False,
             position=self._place(self._session.target),
+            wxyz=self._turned(self._session.target),
         )
 
         async def dragged(event: Any) -> None:
-            self._session.move(event.target.position[: len(self._session.low)])
+            self._session.move(self._point(event.target))
             self._show_target()
 
         handle.on_update(dragged)
@@ -106,9 +115,11 @@ class Page:
         gui, session = self._server.gui, self._session
         words = gui.add_html(self._status(None, 0.0))
         sliders = []
-        with gui.add_folder("Target [m]"):
-            for axis, name in enumerate(_AXES[: len(session.low)]):
-                low, high, value = (round(float(of[axis]), 3) for of in (session.low, session.high, session.target))
+        units = "[m]" if session.roadmap.task.rotations is None else "[m, rad]"
+        ends = [*zip(session.low.tolist(), session.high.tolist(), strict=True), (-math.pi, math.pi)]
+        with gui.add_folder(f"Target {units}"):
+            for axis, name in enumerate(self._moved()):
+                low, high, value = (round(number, 3) for number in (*ends[axis], session.target[axis]))
                 slider = gui.add_slider(name, low, high, 0.001, value)
                 slider.on_update(self._slid(axis))
                 sliders.append(slider)
@@ -122,10 +133,7 @@ class Page:
             for name, part in self._map.parts.items():
                 gui.add_checkbox(name.capitalize(), bool(part.visible)).on_update(_shows(part))
         with gui.add_folder("Keys"):
-            keys = [
-                f"{_AXES[axis]}: **{less}** − **{more}** +"
-                for axis, (more, less) in enumerate(_KEYS[: len(session.low)])
-            ]
+            keys = [f"{name}: **{less}** − **{more}** +" for name, (more, less) in self._moved().items()]
             gui.add_markdown(f"{' · '.join(keys)}\n\n**R** stop · **H** home · **C** clutch")
         return words, sliders
 
@@ -156,10 +164,11 @@ class Page:
         """Hot keys, which are also in the page's list of commands."""
         step = 0.01 * self._size()
         moves: list[tuple[str, str, Callable[[], None]]] = []
-        for axis, keys in enumerate(_KEYS[: len(self._session.low)]):
+        for axis, (name, keys) in enumerate(self._moved().items()):
+            by, said = (_TURN, f"{math.degrees(_TURN):.0f}°") if name == "yaw" else (step, f"{1e3 * step:.0f} mm")
             for key, sign in zip(keys, (1.0, -1.0), strict=True):
-                label = f"Target {'+' if sign > 0 else '−'}{_AXES[axis]} by {1e3 * step:.0f} mm"
-                moves.append((label, key, partial(self._session.nudge, axis, sign * step)))
+                label = f"Target {'+' if sign > 0 else '−'}{name} by {said}"
+                moves.append((label, key, partial(self._session.nudge, axis, sign * by)))
         moves += [
             ("Stop: target to the tool", "R", self._session.reset),
             ("Target home", "H", self._session.go_home),
@@ -180,7 +189,11 @@ class Page:
         place = self._place(self._session.target)
         if not np.allclose(self._handle.position, place, atol=1e-9):
             self._handle.position = place
-        for slider, value in zip(self._sliders, self._session.target, strict=True):
+        target = np.array(self._session.target)
+        # of what the target leaves open, the handle keeps its own
+        if self._session.roadmap.task.gap_of_few(np.array(self._point(self._handle)), target) > 1e-6:
+            self._handle.wxyz = self._turned(self._session.target)
+        for slider, value in zip(self._sliders, self._session.target, strict=False):
             slider.value = float(np.clip(round(value, 3), slider.min, slider.max))
 
     def _status(self, step: Step | None, median: float) -> str:
@@ -189,13 +202,15 @@ class Page:
         hue = "rgb(128,128,128)" if step is None else "rgb({}, {}, {})".format(*colours.STATUS[step.status])
         figures = [("clearance", "–", "mm"), ("to target", "–", "mm"), ("step", "–", "ms")]
         if step is not None:
-            away = np.linalg.norm(np.subtract(self._session.tool, step.target[: len(self._session.tool)]))
+            away, turned = self._session.residuals(step)
             clearance = f"{1e3 * step.clearance:.0f}" if np.isfinite(step.clearance) else "–"
             figures = [
                 ("clearance", clearance, "mm"),
                 ("to target", f"{1e3 * away:.0f}", "mm"),
                 ("step", f"{1e3 * median:.1f}", "ms"),
             ]
+            if self._session.roadmap.task.rotations is not None:
+                figures.insert(2, ("turned", f"{math.degrees(turned):.0f}", "°"))
         cells = "".join(
             f'<div style="flex:1"><div style="opacity:.6;font-size:.8em">{name}</div><span id="grr-{name.split()[-1]}"'
             f' style="font-size:1.35em;font-weight:600">{value}</span> {unit}</div>'
@@ -210,7 +225,7 @@ class Page:
     def _aim(self) -> None:
         """The camera looks at the roadmap: from the side and above, in the plane from above."""
         roadmap = self._session.roadmap
-        points = in_space(roadmap.points[roadmap.resolved].numpy())
+        points = in_space(roadmap.positions[roadmap.resolved].numpy())
         points = np.concatenate([points, np.zeros((1, 3))])
         centre, flat = 0.5 * (points.min(0) + points.max(0)), roadmap.task.dimension == 2
         home = self._place(self._session.target)
@@ -234,8 +249,31 @@ class Page:
 
     def _size(self) -> float:
         """The roadmap's diagonal [m]."""
-        points = self._session.roadmap.points[self._session.roadmap.resolved]
+        points = self._session.roadmap.positions[self._session.roadmap.resolved]
         return max(float((points.amax(0) - points.amin(0)).norm()), 0.05)
+
+    def _moved(self) -> dict[str, tuple[str, str]]:
+        """The coordinates that can be moved one by one, which come first in a point, and their keys."""
+        return {name: _KEYS[name] for name in self._session.roadmap.task.coordinates if name in _KEYS}
+
+    def _point(self, handle: Any) -> list[float]:
+        """The point of the task space that a handle is at."""
+        rotation = matrix_from_quaternion(torch.tensor(handle.wxyz, dtype=torch.float64))
+        position = torch.tensor(handle.position, dtype=torch.float64)
+        point: list[float] = self._session.roadmap.task.at(position[:, None], rotation[..., None])[:, 0].tolist()
+        return point
+
+    def _turned(self, point: tuple[float, ...]) -> np.ndarray:
+        """(4,) a quaternion of a handle at a point, any of those that the point leaves open."""
+        task = self._session.roadmap.task
+        if task.rotations is None:
+            return np.array([1.0, 0.0, 0.0, 0.0])
+        rotations = task.matrices(torch.tensor(point, dtype=torch.float64)[:, None])
+        if rotations is None:
+            assert isinstance(task, Axis)
+            rotations = torch.from_numpy(align_vectors(task.unit_axis, point[3:])[:3, :3, None])
+        quaternion: np.ndarray = quaternion_from_matrix(rotations[..., 0]).numpy()
+        return quaternion
 
     def _place(self, point: tuple[float, ...]) -> np.ndarray:
         """(3,) a point of the task space."""

@@ -14,6 +14,7 @@ from grr_torch.recording import colours
 from grr_torch.recording.robot import displayable
 from grr_torch.recording.self_motion_view import in_space
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.slices import fullest_slice
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.rotation import quaternion_from_matrix
 
@@ -83,7 +84,9 @@ class MapView:
     """
 
     def __init__(self, server: Any, roadmap: Roadmap) -> None:
-        points, resolved = in_space(roadmap.points.numpy()), roadmap.resolved.numpy()
+        # where rotation varies, the rotation in which most is resolved
+        roadmap = fullest_slice(roadmap)
+        points, resolved = in_space(roadmap.positions.numpy()), roadmap.resolved.numpy()
         first = roadmap.configurations[roadmap.resolved][:, 0].numpy()
         shade = colours.circle(first) if bool(roadmap.robot.continuous[0]) else colours.scale(first)
         dots = server.scene.add_point_cloud(
@@ -116,7 +119,7 @@ class MapView:
     @staticmethod
     def _spacing(roadmap: Roadmap) -> float:
         """Median length of an edge [m]."""
-        a, b = roadmap.points[roadmap.edges].unbind(1)
+        a, b = roadmap.positions[roadmap.edges].unbind(1)
         return float((a - b).norm(dim=1).median()) if len(a) else 0.1
 
 

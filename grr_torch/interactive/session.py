@@ -12,6 +12,7 @@ from grr_torch.applications.example_paths import middles
 from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
 from grr_torch.errors import ParameterError
+from grr_torch.projection.project import tool_points
 from grr_torch.resolution.roadmap import Roadmap
 
 # a target may leave what is resolved by this share of its size
@@ -26,9 +27,9 @@ class Session:
     Attributes:
         roadmap: The roadmap.
         rate: Control steps in a second [Hz].
-        low: (width,) lower bounds of the target [m].
-        high: (width,) upper bounds of the target [m].
-        home: (width,) where the target starts [m].
+        low: (d,) lower bounds of the target's position [m].
+        high: (d,) upper bounds of the target's position [m].
+        home: (width,) where the target starts.
         log: All steps.
     """
 
@@ -53,7 +54,7 @@ class Session:
         """
         self.roadmap, self.rate = roadmap, rate
         self.home = middles(roadmap)[0]
-        vertex = (roadmap.points - self.home).norm(dim=1).argmin()
+        vertex = int((roadmap.points == self.home).all(1).nonzero()[0, 0])
         self.teleoperator = Teleoperator(
             roadmap,
             rate,
@@ -61,7 +62,7 @@ class Session:
             max_step=max_step,
             acceleration_limits=acceleration_limits,
         )
-        resolved = roadmap.points[roadmap.resolved]
+        resolved = roadmap.positions[roadmap.resolved]
         low, high = resolved.amin(0), resolved.amax(0)
         self.low, self.high = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
         self.log = TeleoperationLog(roadmap, rate)
@@ -77,7 +78,7 @@ class Session:
 
     @property
     def target(self) -> tuple[float, ...]:
-        """(width,) the target [m]."""
+        """(width,) the target."""
         return self._target
 
     @property
@@ -89,15 +90,16 @@ class Session:
         """Moves the target; one beyond the bounds is put on them.
 
         Raises:
-            ParameterError: It is not finite, or not of the task's width.
+            ParameterError: It is not finite, not of the task's width, or has a direction or quaternion of length zero.
         """
-        given = torch.tensor([float(value) for value in target], dtype=torch.float64)
-        if given.shape != self.low.shape or not bool(given.isfinite().all()):
-            raise ParameterError("target", tuple(target), f"{len(self.low)} finite numbers, in metres")
-        self._target = tuple(given.clamp(self.low, self.high).tolist())
+        task, given = self.roadmap.task, torch.tensor([float(value) for value in target], dtype=torch.float64)
+        if given.shape != self.home.shape or not bool(given.isfinite().all()):
+            raise ParameterError("target", tuple(target), f"finite numbers: {', '.join(task.coordinates)}")
+        position = given[: task.dimension].clamp(self.low, self.high)
+        self._target = tuple(task.unit(torch.cat([position, given[task.dimension :]])).tolist())
 
     def nudge(self, axis: int, distance: float) -> None:
-        """Moves the target along one axis [m]."""
+        """Moves the target along one of its coordinates [m or rad]."""
         moved = list(self._target)
         moved[axis] += distance
         self.move(moved)
@@ -119,6 +121,14 @@ class Session:
         self.reset()
         self._engaged = True
 
+    def residuals(self, step: Step) -> tuple[float, float]:
+        """How far the tool is from a step's target [m], and how far turned [rad]; 0 where rotation is free."""
+        task, position = self.roadmap.task, self.roadmap.robot.forward_kinematics(step.configuration)
+        columns = torch.tensor(step.target, dtype=torch.float64)[:, None]
+        error = task.error(columns.to(position[0]), position[0][:, None], position[1][..., None])
+        away, turned = task.residuals(error)
+        return float(away), float(turned)
+
     def tick(self, at: float | None = None) -> Step:
         """One control step.
 
@@ -136,7 +146,7 @@ class Session:
         else:
             q, status = self.configuration, "holding"
         seconds = time.perf_counter() - start
-        self.tool = tuple(robot.forward_kinematics(q)[0][: self.roadmap.task.dimension].tolist())
+        self.tool = tuple(tool_points(robot, self.roadmap.task, q[None])[0].tolist())
         clearance = float(robot.self_collision_distance(q)) - robot.margin
         step = Step(len(self.log) / self.rate if at is None else at, target, q, status, clearance, seconds)
         self.log.append(step)

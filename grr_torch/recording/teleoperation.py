@@ -16,6 +16,7 @@ from grr_torch.recording import colours
 from grr_torch.recording.colours import Colours
 from grr_torch.recording.robot import RecordedRobot
 from grr_torch.recording.self_motion_view import in_space, line, palette
+from grr_torch.resolution.slices import fullest_slice
 
 TIME = "teleoperation"
 _DARK = (18, 20, 26)
@@ -28,7 +29,8 @@ def record_teleoperation(log: TeleoperationLog, path: str | os.PathLike[str]) ->
 
     All of it is on the timeline `teleoperation`. Entities: `space/target` and `space/tool` are where they are,
     `space/trace` the tool's way so far in the colours of the status, `space/whole` all of it, `space/asked` the
-    target's way; `joints/…` are curves, unwrapped; `status`, `clearance` and `distance` what their names say.
+    target's way; `joints/…` are curves, unwrapped; `status`, `clearance`, `distance` and `turn` what their names
+    say.
 
     Args:
         log: The steps.
@@ -77,11 +79,11 @@ class _Scene:
         self._log_curves(recording, times)
 
     def _log_map(self, recording: Any) -> None:
-        """The roadmap, faint behind the arm."""
+        """The roadmap, faint behind the arm; where rotation varies, one rotation of it."""
         import rerun as rr
 
-        roadmap = self.log.roadmap
-        points, frame = in_space(roadmap.points.numpy()), rr.CoordinateFrame(roadmap.robot.base)
+        roadmap = fullest_slice(self.log.roadmap)
+        points, frame = in_space(roadmap.positions.numpy()), rr.CoordinateFrame(roadmap.robot.base)
         resolved = roadmap.resolved.numpy()
         dots = rr.Points3D(points[resolved], colors=(96, 104, 120), radii=line(1.0))
         recording.log("space/roadmap/vertices", frame, dots, static=True)
@@ -154,6 +156,8 @@ class _Scene:
             for index, (name, hue) in enumerate(zip(robot.joint_names, palette(robot.n), strict=True))
         ]
         curves.append(("distance", "tool to target", (150, 190, 255), 1e3 * self.log.deviations))
+        if (turns := self.log.turns) is not None:
+            curves.append(("turn", "tool to target", (230, 190, 140), turns.rad2deg()))
         if robot.spheres is not None:
             curves.append(("clearance", "clearance", (120, 220, 150), 1e3 * self.log.clearances))
         for entity, name, hue, values in curves:
@@ -184,6 +188,9 @@ class _Scene:
             rrb.TimeSeriesView(origin="/distance", name="from tool to target [mm]", plot_legend=_no_legend()),
         ]
         shares = [1.1, 4.0, 2.0]
+        if roadmap.task.rotations is not None:
+            over_time.append(rrb.TimeSeriesView(origin="/turn", name="turned from it [°]", plot_legend=_no_legend()))
+            shares.append(2.0)
         if roadmap.robot.spheres is not None:
             clearance = "self-collision distance beyond the margin [mm]"
             over_time.append(rrb.TimeSeriesView(origin="/clearance", name=clearance, plot_legend=_no_legend()))

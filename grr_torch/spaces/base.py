@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import Array
+from grr_torch.pieces import Array, norms
 from grr_torch.spaces.rotations import Rotations
 
 # weights of translation and rotation in D_p (Section IV-B of the paper)
@@ -122,6 +122,26 @@ class TaskSpace(ABC):
         if self.rotations is None:
             return translation
         return torch.cat([translation, self.rotations.interpolate(start[..., d:], end[..., d:], fraction)], dim=-1)
+
+    def interpolate_few(self, start: Array, end: Array, fraction: Array | float) -> Array:
+        """`interpolate` for arrays."""
+        if self.rotations is None:
+            return start + fraction * (end - start)
+        between = fraction if isinstance(fraction, float) else torch.from_numpy(fraction)
+        return self.interpolate(torch.from_numpy(start), torch.from_numpy(end), between).numpy()
+
+    def gap_of_few(self, first: Array, second: Array) -> Array:
+        """How far arms have to go between points (*batch, width) [m]: a radian of rotation counts as 0.3 m.
+
+        Other than D_p, in which small turns count for next to nothing, it grows with the angle itself.
+        """
+        d = self.dimension
+        if self.rotations is None:
+            return norms(first - second)
+        turns = (torch.from_numpy(part[..., d:]) for part in (first, second))
+        # the distance of rotations is 1 − cos(θ / 2)
+        half = 2.0 * np.arcsin(np.sqrt(np.clip(0.5 * self.rotations.distance(*turns).numpy(), 0.0, 1.0)))
+        return np.hypot(norms(first[..., :d] - second[..., :d]), ROTATION_WEIGHT * 2.0 * half)
 
     def centre(self, points: Tensor) -> Tensor:
         """The middle (*batch, width) of points (*batch, k, width) that are near each other."""

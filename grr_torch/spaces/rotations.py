@@ -62,6 +62,10 @@ class Rotations(ABC):
     def centre(self, rows: Tensor) -> Tensor:
         """The middle (*batch, w) of rows (*batch, k, w) that are near each other."""
 
+    def are_rotations(self, rows: Tensor) -> Tensor:
+        """(*batch,) which rows (*batch, w) stand for a rotation: finite ones that have a length, if they need one."""
+        return rows.isfinite().all(-1) & ((len(self.names) == 1) | (rows.norm(dim=-1) > _LEAST_LENGTH))
+
     @abstractmethod
     def unit(self, rows: Tensor) -> Tensor:
         """Rows as they are stored.
