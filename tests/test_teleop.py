@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -121,6 +123,16 @@ def test_the_loop_ends_when_it_is_told_to(planar_roadmap):
     assert bool((times.diff() > 0.0).all())
     # never faster than the rate
     assert float(times[-1]) >= 11 / 200.0 - 1e-3
+
+
+def test_an_arm_with_slow_joints_gets_a_slower_path(kinova_roadmap):
+    """So that its tool stays at its target: by its usual speed it would fall behind."""
+    robot = kinova_roadmap.robot
+    usual = example_path(kinova_roadmap, "circle")
+    slow = replace(kinova_roadmap, robot=replace(robot, velocity_limits=robot.velocity_limits / 10.0))
+    path = example_path(slow, "circle")
+    assert len(path) > 1.5 * len(usual)
+    assert replay(slow, path).summary().largest_deviation < 2e-3
 
 
 @pytest.mark.parametrize("kind", KINDS)

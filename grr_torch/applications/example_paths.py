@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from grr_torch.applications.retime import usual_speeds
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.slices import fullest_slice
@@ -19,7 +21,7 @@ KINDS = ("circle", "line")
 _SPEED, _FASTEST = 0.15, 1e4
 # points at which a candidate is tried, sizes that are tried, and middles
 _POINTS, _SIZES, _MIDDLES = 96, 16, 5
-# of the largest size that fits, so that the path is not on the edge of reach
+# of the largest size that fits, so that the path is not on the edge of reach; and of the joints' velocity limits
 _SHARE = 0.8
 # two configurations farther apart than this are not neighbours on a path [rad]
 _APART = 0.4
@@ -56,7 +58,8 @@ def example_path(roadmap: Roadmap, kind: str, rate: float = 50.0) -> Tensor:
     """A large circle or line (N, width) on which the roadmap is continuous, one waypoint for each control step [m].
 
     A circle is horizontal and ends where it began, and so does a line: it goes there and back. The tool moves at
-    0.15 m/s, and its rotation stays. Circles round the base's axis are tried too.
+    0.15 m/s, or as fast as 0.8 of the joints' velocity limits allow, and its rotation stays. Circles round the base's
+    axis are tried too.
 
     Args:
         roadmap: The roadmap.
@@ -82,16 +85,23 @@ def example_path(roadmap: Roadmap, kind: str, rate: float = 50.0) -> Tensor:
     for size in sizes.tolist():
         if largest is not None and size > _SHARE * largest:
             continue
-        tried = _circles(centres, size, _POINTS) if kind == "circle" else _lines(centres, d, size, _POINTS)
-        fits = _passable(roadmap, tried).nonzero()[:, 0]
+        draw = partial(_circles, centres, size) if kind == "circle" else partial(_lines, centres, d, size)
+        fits = _passable(roadmap, draw(_POINTS)).nonzero()[:, 0]
         if largest is None and len(fits) and size > sizes[-1]:
             largest = size
         elif len(fits):
             length = 2.0 * math.pi * size if kind == "circle" else 4.0 * size
             count = max(8, round(length / _SPEED * rate)) + 1
-            drawn = _circles(centres, size, count) if kind == "circle" else _lines(centres, d, size, count)
-            return drawn[fits[0]]
+            busiest = _busiest(roadmap, draw(count)[fits[0]]) * rate
+            return draw(round(count * max(1.0, busiest / _SHARE)))[fits[0]]
     raise ParameterError("path", kind, "one that fits into the roadmap; this roadmap is too small for it")
+
+
+def _busiest(roadmap: Roadmap, path: Tensor) -> float:
+    """The longest step of a joint along a path (N, width), by how far it gets in a second."""
+    q = roadmap.solve(path).configurations
+    steps = difference(q[:-1], q[1:], roadmap.robot.continuous).abs() / usual_speeds(roadmap.robot.velocity_limits)
+    return float(steps.max())
 
 
 def _circles(centres: Tensor, radius: float, count: int) -> Tensor:
