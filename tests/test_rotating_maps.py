@@ -88,6 +88,18 @@ def test_what_cannot_be_reached_is_said_so(planar_pose):
     assert status[2] in ("solved", "uncertified")
 
 
+def test_every_resolved_vertex_is_solved_at_its_own_point(kinova):
+    """On a coarse map with many broken edges, in which some vertices lie in the smaller part of what is around them."""
+    roadmap = grr_torch.build(kinova, "axis", points=150, rotations=12, candidates=2, refine=False)
+    points = roadmap.points[roadmap.resolved]
+    solution = roadmap.solve(points)
+    assert bool(solution.valid.all())
+    first = roadmap.solver.solve_from(points.T.contiguous(), *roadmap.solver.guess(points))[1]
+    failed = first.numpy() > 1
+    assert failed.any()
+    assert set(solution.status[failed]) == {"uncertified"}
+
+
 def test_poses_beside_a_broken_edge_are_uncertified(planar_pose):
     first, second = planar_pose.edges[planar_pose.connected][60]
     broken = (planar_pose.edges == torch.stack([first, second])).all(1)

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from grr_torch.applications.around import Around, AroundProduct
+from grr_torch.applications.joined import MATRIX, Joined
 from grr_torch.applications.many_guesses import MOST_VERTICES, ManyGuesses
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import FEW, Array, Mask, one_thread, together
@@ -31,8 +32,6 @@ _SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_C
 
 # points worked on together
 _AT_ONCE = 1 << 12
-# the most vertices of which a matrix of neighbours is made: 16 MiB
-_MATRIX = 4096
 # radians of self-motion from the average beyond which a configuration is none of the map's
 _OFF_MAP = 0.5
 
@@ -91,13 +90,12 @@ class Solver:
         self._continuous = self.robot.continuous.cpu()
         self._embedded = embed(roadmap.configurations[vertices].to(torch.float64), self._continuous)
         self._embedded_array, self._continuous_array = self._embedded.numpy(), self._continuous.numpy()
-        self._neighbours = tuple(part.numpy() for part in roadmap.neighbours)
-        self._joined = _neighbour_matrix(roadmap, vertices).numpy() if len(vertices) <= _MATRIX else None
+        self._joined = Joined(roadmap, vertices)
         # where rotation varies, suspects are looked up by their nearest vertices
         self._lattice = None if turning else find_lattice(roadmap.points)
         self._suspect = self._uncertified_places(roadmap)
         # of a large roadmap, such a table would take long to make; without a grid there is no other way
-        small = self._suspect is not None and (self._lattice is None or len(vertices) <= _MATRIX)
+        small = self._suspect is not None and (self._lattice is None or len(vertices) <= MATRIX)
         self._near_suspect = self._near_uncertified(roadmap) if small else None
 
     def __call__(self, points: Tensor, *, progress: Progress = silent) -> Solution:
@@ -119,8 +117,19 @@ class Solver:
         return Solution(q.reshape(*batch, self.robot.n), valid.reshape(batch), status)
 
     def solve_columns(self, targets: Tensor) -> tuple[Tensor, Tensor]:
-        """Configurations (n, N), NaN where not valid, and indices into STATUSES (N,) for points (width, N)."""
-        return self.solve_from(targets, *self.guess(targets.T.cpu().to(torch.float64)))
+        """Configurations (n, N), NaN where not valid, and indices into STATUSES (N,) for points (width, N).
+
+        Where that comes to nothing, as near a vertex that lies in the smaller part itself, the part of the nearest
+        vertex is tried.
+        """
+        points = targets.T.cpu().to(torch.float64)
+        q, codes = self.solve_from(targets, *self.guess(points))
+        failed = (codes >= _NOT_CONVERGED).nonzero()[:, 0]
+        if len(failed):
+            again, second = self.solve_from(targets[:, failed], *self.guess(points[failed], of_nearest=True))
+            good = second <= _UNCERTIFIED
+            q[:, failed[good]], codes[failed[good]] = again[:, good], _UNCERTIFIED
+        return q, codes
 
     def solve_from(
         self, targets: Tensor, guesses: Tensor, codes: Tensor, tolerances: Tolerances | None = None
@@ -148,14 +157,16 @@ class Solver:
 
     # points beyond all numbers are outside
     @np.errstate(over="ignore", invalid="ignore")
-    def guess(self, points: Tensor, *, certified: bool = True) -> tuple[Tensor, Tensor]:
+    def guess(self, points: Tensor, *, certified: bool = True, of_nearest: bool = False) -> tuple[Tensor, Tensor]:
         """Averages (N, n) for points (N, width) on the CPU, and what is known of the points so far (N,).
 
         The averages may be on the robot's device. 2n multiply-adds a neighbour, and the search for the connected ones.
-        Whether the points' cells are certified is looked up only if asked for.
+        Whether the points' cells are certified is looked up only if asked for. The averages are over the largest part
+        of the vertices around, or over that `of_nearest`.
         """
         positions = points[:, : self.task.dimension].numpy()
-        averages, nearest, known = self._known(points) if self._many is None else self._many(points)
+        many = None if of_nearest else self._many
+        averages, nearest, known = self._known(points, of_nearest) if many is None else many(points)
         codes = np.full(len(points), _SOLVED, dtype=np.uint8)
         if certified:
             self._mark_uncertified(codes, positions, nearest)
@@ -163,10 +174,10 @@ class Solver:
         codes[((positions < self._low) | (positions > self._high)).any(1)] = _OUTSIDE
         return averages, torch.from_numpy(codes)
 
-    def _known(self, points: Tensor) -> tuple[Tensor, Array, Mask]:
+    def _known(self, points: Tensor, of_nearest: bool) -> tuple[Tensor, Array, Mask]:
         """Averages (N, n) for points (N, width), their nearest vertices' ranks (N,), and which there are (N,)."""
         nearest, weights, near = self._around.weigh(points)
-        weights = weights * self._largest_part(nearest, weights > 0.0)
+        weights = weights * self._joined.one_part(nearest, weights > 0.0, of_nearest)
         return self._averages(nearest, weights), nearest[:, 0], near & (weights.sum(1) > 0.0)
 
     def _averages(self, nearest: Array, weights: Array) -> Tensor:
@@ -202,46 +213,6 @@ class Solver:
         """The k nearest resolved vertices of points (N, width) on the CPU: distances (N, k) and vertices (N, k)."""
         distances, index = self._around.nearest(points, k)
         return distances, self.vertices[index]
-
-    def _largest_part(self, nearest: NDArray[Any], counts: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which of the vertices (N, k) lie in the largest part connected by edges among them; the nearest of equals.
-
-        Only those that count (N, k) do. A set of them is a number: vertex j is its bit j.
-        """
-        k = nearest.shape[1]
-        if self._joined is not None:
-            joined = self._joined.take(nearest[:, :, None] * len(self.vertices) + nearest[:, None, :])
-        else:
-            near = self.vertices.numpy()[nearest]
-            joined = (self._ends(near)[..., None] == near[:, None, None, :]).any(2)
-        bits = 1 << np.arange(k)
-        counted = counts @ bits
-        around = np.where(counts, (joined @ bits | bits) & counted[:, None], 0)
-        # most points have all of them in one part: what the first is joined to, and so on
-        part, before = around[:, 0], around[:, 0] * 0
-        while (part != before).any():
-            before = part
-            part = np.bitwise_or.reduce(np.where(part[:, None] & bits, around, 0), axis=1)
-        left = (part != counted).nonzero()[0]
-        if len(left):
-            # Warshall's closure: whoever is joined to j is joined to all that j is joined to
-            closed = around[left]
-            for j in range(k):
-                closed |= np.where(closed >> j & 1, closed[:, j : j + 1], 0)
-            sizes = (closed[:, :, None] >> np.arange(k) & 1).sum(2)
-            part[left] = np.take_along_axis(closed, sizes.argmax(1)[:, None], axis=1)[:, 0]
-        return part[:, None] & bits != 0
-
-    def _ends(self, vertices: NDArray[Any]) -> NDArray[Any]:
-        """(N, k, D) neighbours along connected edges of vertices (N, k); −1 where there are fewer."""
-        starts, ends = self._neighbours
-        first = starts[vertices]
-        counts = starts[vertices + 1] - first
-        column = np.arange(max(1, int(counts.max()) if counts.size else 1))
-        if len(ends) == 0:
-            return np.full((*vertices.shape, 1), -1)
-        index = np.minimum(first[..., None] + column, len(ends) - 1)
-        return np.where(column < counts[..., None], ends[index], -1)
 
     def _mark_uncertified(self, codes: NDArray[np.uint8], positions: NDArray[Any], nearest: NDArray[Any]) -> None:
         """Sets the codes of points in uncertified cells: by their pyramids in a grid, else by their nearest vertex."""
@@ -283,14 +254,3 @@ class Solver:
         for corners in cells:
             suspect[self._lattice.pyramids_at(corners)] = True
         return suspect
-
-
-def _neighbour_matrix(roadmap: Roadmap, vertices: Tensor) -> Tensor:
-    """(R, R) bool, which resolved vertices a connected edge joins: faster to look up, where it is not too large."""
-    rank = torch.full((len(roadmap.points),), -1)
-    rank[vertices] = torch.arange(len(vertices))
-    first, second = rank[roadmap.edges[roadmap.connected]].T
-    joined = torch.zeros(len(vertices), len(vertices), dtype=torch.bool)
-    joined[first, second] = True
-    joined[second, first] = True
-    return joined
