@@ -190,11 +190,11 @@ def test_arms_go_round_what_cannot_be_followed(planar_pose):
 @pytest.mark.parametrize("name", ["planar_pose", "yaw"])
 def test_a_replay_tells_how_far_the_tool_was_turned(request, name):
     roadmap = request.getfixturevalue(name)
-    path = example_path(roadmap, "line")
+    path = example_path(roadmap, "circle")
     assert path.shape[1] == roadmap.task.width
     log = replay(roadmap, path)
     summary = log.summary()
-    assert summary.final_deviation < 1e-3
+    assert summary.final_deviation < 2e-3
     assert summary.final_turn < 1e-2
     target, q = log.targets[-1], log.configurations[-1]
     position, rotation = roadmap.robot.forward_kinematics(q[None])

@@ -190,12 +190,8 @@ class Pilot:
         arms.due[which] = np.maximum(arms.due[which] - 1, 1)
         stretched = (norms(offsets) > _NEAR).nonzero()[0]
         if len(stretched):
-            here, away = arms.q[which[stretched]], guesses[stretched]
-            # where a step is enough to come there it need not be slow
-            close = self.follower.share(self.follower.difference(here, away + offsets[stretched])) >= 1.0
-            pace[stretched] = np.where(
-                close, pace[stretched], self.follower.share(self.follower.difference(here, away))
-            )
+            motion = self.follower.difference(arms.q[which[stretched]], guesses[stretched])
+            pace[stretched] = self.follower.share(motion)
         lines = self.follower.follow(arms.q[which], arms.p[which], guesses, goals, offsets, pace)
         offsets = self.follower.difference(guesses, lines.ends)
         found = ~lost & lines.converged & ~lines.collides
