@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,6 +12,7 @@ from grr_torch.cli.bench_learning import learning
 from grr_torch.cli.bench_rotations import rotations
 from grr_torch.cli.bench_scale import scale
 from grr_torch.cli.bench_teleop import teleop
+from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ def speed(
         bool,
         typer.Option("--profile", help="Where the time of builds and of the projection goes, instead of the table."),
     ] = False,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+    json_file: FiguresFile = None,
 ) -> None:
     """Print how fast everything is beside other libraries, as a Markdown table.
 
@@ -66,7 +65,7 @@ def speed(
     import torch
 
     from grr_torch.experiments.speed import measure_speed
-    from grr_torch.output import atomic_write, check_outputs
+    from grr_torch.output import check_outputs
 
     if threads is not None:
         torch.set_num_threads(threads)
@@ -82,9 +81,7 @@ def speed(
             device=device,
             progress=progress,
         )
-    if json_file is not None:
-        with atomic_write(json_file) as path:
-            path.write_text(json.dumps(table.to_dict(), indent=2, ensure_ascii=False), encoding="utf-8")
+    write_figures(json_file, table.to_dict())
     _show_speed(table)
 
 
@@ -98,7 +95,7 @@ def roadmap(
     reachability: Annotated[int, typer.Option(min=1, help="Random starts a vertex: which are reachable?")] = 40,
     samples: Annotated[int, typer.Option(min=1, help="Random configurations a vertex, for random.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+    json_file: FiguresFile = None,
 ) -> None:
     """Print the quality of the paper's four problems by every method, as a Markdown table.
 
@@ -107,19 +104,15 @@ def roadmap(
     Example: grr-torch bench roadmap --method preset --method auto
     """
     from grr_torch.experiments.roadmaps import measure_roadmaps
-    from grr_torch.experiments.timing import machine
-    from grr_torch.output import atomic_write, check_outputs
+    from grr_torch.output import check_outputs
 
     check_outputs({"--json": json_file})
     with progress_bar() as progress:
         results = measure_roadmaps(
             robots=robot, methods=method, reachability=reachability, samples=samples, seed=seed, progress=progress
         )
-    if json_file is not None:
-        with atomic_write(json_file) as path:
-            data = {"machine": machine(), "roadmaps": [result.to_dict() for result in results]}
-            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
-    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    write_figures(json_file, {"roadmaps": [result.to_dict() for result in results]})
+    show_machine()
     head = ["problem", "method", "resolved / reachable", "connected / edges", "smoothness", "99 %, largest slope"]
     head += ["certified triangles", "squares", "time [s]", "the paper: connectivity, smoothness, time"]
     typer.echo(markdown_table(head, [_roadmap_row(result) for result in results]))
@@ -135,23 +128,21 @@ def trade(
     ] = None,
     weight: Annotated[list[float] | None, typer.Option(help="Repeatable; by default 0.1, 0.3, 1 and 3.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+    json_file: FiguresFile = None,
 ) -> None:
     """Print what secondary objectives cost in smoothness, as a Markdown table.
 
     Example: grr-torch bench trade --robot kinova --objective clearance --weight 0.3 --weight 1
     """
     from grr_torch.experiments.trade import WEIGHTS, measure_trade
-    from grr_torch.output import atomic_write, check_outputs
+    from grr_torch.output import check_outputs
 
     check_outputs({"--json": json_file})
     with progress_bar() as progress:
         trades = measure_trade(
             robot, task, objectives=objective, weights=weight or WEIGHTS, seed=seed, progress=progress
         )
-    if json_file is not None:
-        with atomic_write(json_file) as path:
-            path.write_text(json.dumps([row.to_dict() for row in trades], indent=2), encoding="utf-8")
+    write_figures(json_file, {"trades": [row.to_dict() for row in trades]})
     names = list(trades[0].values)
     head = ["objective", "weight", "smoothness", "connected", "certified", *(f"{name}: mean, worst" for name in names)]
     rows = [

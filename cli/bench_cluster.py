@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from grr_torch.cli.figures import show_machine
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
 
@@ -21,11 +22,10 @@ def cluster(
     Example: grr-torch bench cluster --robot planar_5 --task position --points 2000
     """
     from grr_torch.experiments.cluster import measure_cluster
-    from grr_torch.experiments.timing import machine
 
     with progress_bar() as progress:
         cost = measure_cluster(robot, task, points, workers=workers, repeats=repeats, progress=progress)
-    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    show_machine()
     edge, vertex = 1e6 / max(1, cost.checked), 1e6 / cost.vertices
     rows = [
         ["memory of a vertex", f"{cost.bytes_vertex:.0f} bytes"],

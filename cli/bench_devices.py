@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ def devices(
     samples: Annotated[int, typer.Option(min=1, help="Rows to export, and to train from.")] = 100_000,
     epochs: Annotated[int, typer.Option(min=1, help="Epochs to train.")] = 3,
     repeats: Annotated[int, typer.Option(min=1, help="Roadmaps and solving: medians of so many.")] = 3,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+    json_file: FiguresFile = None,
 ) -> None:
     """Print how long the same work takes on several devices, and what comes out, as a Markdown table.
 
@@ -37,8 +36,7 @@ def devices(
     import torch
 
     from grr_torch.experiments.devices import measure_devices
-    from grr_torch.experiments.timing import machine
-    from grr_torch.output import atomic_write, check_outputs
+    from grr_torch.output import check_outputs
 
     check_outputs({"--json": json_file})
     with progress_bar() as progress:
@@ -51,11 +49,8 @@ def devices(
             repeats=repeats,
             progress=progress,
         )
-    if json_file is not None:
-        with atomic_write(json_file) as path:
-            data = {"machine": machine(), "work": [result.to_dict() for result in results]}
-            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
-    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    write_figures(json_file, {"work": [result.to_dict() for result in results]})
+    show_machine()
     typer.echo(markdown_table(["work", "device", "time [s]", "what comes out"], [_row(result) for result in results]))
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
 if TYPE_CHECKING:
@@ -20,7 +19,7 @@ def effort(
     task: Annotated[
         list[str] | None, typer.Option(help="position or fixed-rotation; repeatable; both by default.")
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+    json_file: FiguresFile = None,
 ) -> None:
     """Print the best refined roadmaps of many draws of found seeds, as a Markdown table.
 
@@ -30,17 +29,13 @@ def effort(
     Example: grr-torch bench effort --robot kinova --task position --draws 20
     """
     from grr_torch.experiments.effort import measure_effort
-    from grr_torch.experiments.timing import machine
-    from grr_torch.output import atomic_write, check_outputs
+    from grr_torch.output import check_outputs
 
     check_outputs({"--json": json_file})
     with progress_bar() as progress:
         results = measure_effort(draws, robots=robot, tasks=task, progress=progress)
-    if json_file is not None:
-        with atomic_write(json_file) as path:
-            data = {"machine": machine(), "draws": draws, "roadmaps": [result.to_dict() for result in results]}
-            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
-    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    write_figures(json_file, {"draws": draws, "roadmaps": [result.to_dict() for result in results]})
+    show_machine()
     head = ["problem", "seeds", "resolved", "connected", "smoothness", "certified triangles", "time [s]"]
     typer.echo(markdown_table(head, [_row(result) for result in results]))
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 from grr_torch.cli.show_learning import WARM_HEAD, statistics, warm_rows
 
@@ -30,7 +30,7 @@ def learning(
     samples: Annotated[int, typer.Option(help="Points drawn, a tenth each for validation and test.")] = 500_000,
     points: Annotated[int, typer.Option(help="Held-out points that are measured.")] = 20_000,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+    json_file: FiguresFile = None,
 ) -> None:
     """Print what a network learns from a roadmap, beside the same network with other labels, as Markdown tables.
 
@@ -41,9 +41,8 @@ def learning(
     Example: grr-torch bench learning kinova.grr --epochs 10 --samples 100000
     """
     from grr_torch.experiments.learning import LABELS, compare_warm_starts, measure_learning
-    from grr_torch.experiments.timing import machine
     from grr_torch.learning.options import TrainingOptions
-    from grr_torch.output import atomic_write, check_outputs
+    from grr_torch.output import check_outputs
     from grr_torch.resolution.build import build
     from grr_torch.resolution.roadmap import Roadmap
     from grr_torch.robots.load import load_robot
@@ -59,11 +58,9 @@ def learning(
             roadmap, options, labels=names, points=points, on_epoch=_show_epoch, progress=progress
         )
         warm = compare_warm_starts(outcomes[0].ik, roadmap, points=points, seed=seed + 1)
-    if json_file is not None:
-        rows = {"runs": [outcome.to_dict() for outcome in outcomes], "warm_start": [row.to_dict() for row in warm]}
-        with atomic_write(json_file) as path:
-            path.write_text(json.dumps({"machine": machine(), **rows}, indent=2), encoding="utf-8")
-    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    runs = [outcome.to_dict() for outcome in outcomes]
+    write_figures(json_file, {"runs": runs, "warm_start": [row.to_dict() for row in warm]})
+    show_machine()
     typer.echo(_errors_table(outcomes) + "\n")
     typer.echo(_continuity_table(outcomes) + "\n")
     typer.echo(f"With labels {names[0]}:\n\n" + markdown_table(WARM_HEAD, warm_rows(warm)))

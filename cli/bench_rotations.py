@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ def rotations(
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Refine the roadmaps.")] = True,
     reachability: Annotated[int, typer.Option(min=1, help="Random starts a vertex: which are reachable?")] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+    json_file: FiguresFile = None,
 ) -> None:
     """Print the quality and the cost of roadmaps in which rotation varies, as a Markdown table.
 
@@ -33,8 +32,7 @@ def rotations(
     Example: grr-torch bench rotations --problem "planar_5 pose"
     """
     from grr_torch.experiments.rotations import measure_rotations
-    from grr_torch.experiments.timing import machine
-    from grr_torch.output import atomic_write, check_outputs
+    from grr_torch.output import check_outputs
 
     check_outputs({"--json": json_file})
     with progress_bar() as progress:
@@ -47,11 +45,8 @@ def rotations(
             seed=seed,
             progress=progress,
         )
-    if json_file is not None:
-        with atomic_write(json_file) as path:
-            data = {"machine": machine(), "roadmaps": [result.to_dict() for result in results]}
-            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
-    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    write_figures(json_file, {"roadmaps": [result.to_dict() for result in results]})
+    show_machine()
     head = ["problem", "positions × rotations", "resolved / reachable", "connected / edges", "smoothness [rad/m]"]
     head += ["certified triangles", "certified squares", "time [s]", "peak memory [MiB]"]
     typer.echo(markdown_table(head, [_row(result) for result in results]))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
 from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def scale(
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Whether roadmaps are refined.")] = True,
     repeats: Annotated[int, typer.Option(min=1, help="Opening and solving: medians over so many processes.")] = 3,
     plot: Annotated[Path | None, typer.Option(help="Draw all figures into this PNG file.", metavar="FILE.png")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")] = None,
+    json_file: FiguresFile = None,
 ) -> None:
     """Print how time, memory, file size and opening grow with the vertices, as a Markdown table.
 
@@ -50,7 +50,6 @@ def scale(
     from grr_torch.errors import ParameterError
     from grr_torch.experiments.scale import SIZES, exponents, measure_scale
     from grr_torch.experiments.scale import plot as draw
-    from grr_torch.experiments.timing import machine
     from grr_torch.output import atomic_write, check_outputs
 
     if plot is not None and plot.suffix != ".png":
@@ -59,14 +58,11 @@ def scale(
     with progress_bar() as progress:
         rows = measure_scale(robot, task, sizes=points or SIZES, refine=refine, repeats=repeats, progress=progress)
     powers = exponents(rows)
-    if json_file is not None:
-        data = {"machine": machine(), "sizes": [row.__dict__ for row in rows], "exponents": powers}
-        with atomic_write(json_file) as path:
-            path.write_text(json.dumps(data, indent=2, ensure_ascii=False), encoding="utf-8")
+    write_figures(json_file, {"sizes": [row.__dict__ for row in rows], "exponents": powers})
     if plot is not None:
         with atomic_write(plot) as path:
             draw(rows, path)
-    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    show_machine()
     lines = [_line(row) for row in rows]
     if powers:
         lines.append(["exponent", *(f"{powers[name]:.2f}" for name in _COLUMNS)])

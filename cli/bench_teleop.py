@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.figures import show_machine
 from grr_torch.cli.show import markdown_table, print_json, progress_bar, reports_errors
 
 from grr_torch.errors import ParameterError
@@ -70,7 +71,7 @@ def teleop(
     if as_json:
         print_json({"machine": machine(), "runs": results})
         return
-    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
+    show_machine()
     head = ["kind", "method", "success", "deviation [m]: all, of paths that all solve", "tilt [rad]"]
     head += ["smoothness [rad/m]: all, of paths that all solve", "largest step [rad]", "acceleration [rad/s²]"]
     head += ["closure [rad]", "longest stall [s]", "step [ms]"]

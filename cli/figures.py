@@ -1,0 +1,30 @@
+"""What commands that measure have in common: the file for their figures, and on what they were measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+FiguresFile = Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")]
+
+
+def write_figures(file: Path | None, figures: Mapping[str, Any]) -> None:
+    """Writes figures as JSON, and what they were measured on, by an atomic rename, if a file is asked for."""
+    from grr_torch.experiments.timing import machine
+    from grr_torch.output import atomic_write
+
+    if file is not None:
+        with atomic_write(file) as path:
+            text = json.dumps({"machine": machine(), **figures}, indent=2, ensure_ascii=False)
+            path.write_text(text, encoding="utf-8")
+
+
+def show_machine() -> None:
+    """Prints what figures were measured on."""
+    from grr_torch.experiments.timing import machine
+
+    typer.echo(", ".join(f"{name} {value}" for name, value in machine().items()) + "\n")
