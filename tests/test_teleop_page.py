@@ -184,7 +184,7 @@ def test_a_page_of_a_planar_arm_has_two_sliders(planar_roadmap):
     try:
         page.show(session.tick())
         assert len(page._sliders) == 2
-        assert page._handle.active_axes == (True, True, False)
+        assert page._handle.controls.active_axes == (True, True, False)
         assert "–" in page._words.content  # it has no clearance: there is no sphere model
     finally:
         page.close()

@@ -227,13 +227,13 @@ def test_the_handle_of_a_page_is_where_the_target_is(request, name):
     try:
         page.show(session.tick())
         assert len(page._sliders) == {"planar_pose": 3, "yaw": 4, "axis": 3}[name]
-        assert not page._handle.disable_rotations
+        assert not page._handle.controls.disable_rotations
         here = np.array(session.target)
-        assert roadmap.task.gap_of_few(np.array(page._point(page._handle)), here) < 1e-6
+        assert roadmap.task.gap_of_few(np.array(page._handle.point()), here) < 1e-6
         moved = roadmap.points[some_vertices(roadmap, 1, 4)[0]]
         session.move(moved.tolist())
         page._show_target()
-        assert roadmap.task.gap_of_few(np.array(page._point(page._handle)), moved.numpy()) < 1e-6
+        assert roadmap.task.gap_of_few(np.array(page._handle.point()), moved.numpy()) < 1e-6
         assert "turned" in page._status(session.tick(), 0.0)
     finally:
         page.close()

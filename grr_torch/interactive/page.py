@@ -12,17 +12,14 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
-from trimesh.geometry import align_vectors
 
 from grr_torch.applications.teleoperation_log import Step
 from grr_torch.errors import MissingPackageError, ParameterError
+from grr_torch.interactive.handle import Handle
 from grr_torch.interactive.scene import ArmView, MapView, TrailView
 from grr_torch.interactive.session import Session
 from grr_torch.recording import colours
 from grr_torch.recording.self_motion_view import in_space
-from grr_torch.spaces.rotation import matrix_from_quaternion, quaternion_from_matrix
-from grr_torch.spaces.task import Axis
 
 # the arm and the words on the page are renewed so often [s]
 _ARM_PERIOD, _WORDS_PERIOD = 1.0 / 30.0, 0.1
@@ -59,7 +56,8 @@ class Page:
         self._arm, self._map = ArmView(self._server, robot), MapView(self._server, session.roadmap)
         self._trail = TrailView(self._server, self._place(session.tool))
         self._dot = self._server.scene.add_icosphere("/tool", radius=0.012 * self._size(), color=(255, 255, 255))
-        self._handle = self._add_handle()
+        task, size = session.roadmap.task, 0.16 * self._size()
+        self._handle = Handle(self._server, task, size, session.target, self._dragged)
         self._words, self._sliders = self._add_panel()
         self._add_keys()
         self._shown = (-1.0, -1.0)
@@ -88,27 +86,9 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    def _add_handle(self) -> Any:
-        """What is dragged."""
-        task = self._session.roadmap.task
-        handle = self._server.scene.add_transform_controls(
-            "/target",
-            scale=0.16 * self._size(),
-            line_width=3.5,
-            # in the plane it would have no ring to turn it by
-            active_axes=(True, True, task.dimension == 3 or task.rotations is not None),
-            disable_rotations=task.rotations is None,
-            depth_test=False,
-            position=self._place(self._session.target),
-            wxyz=self._turned(self._session.target),
-        )
-
-        async def dragged(event: Any) -> None:
-            self._session.move(self._point(event.target))
-            self._show_target()
-
-        handle.on_update(dragged)
-        return handle
+    def _dragged(self, point: list[float]) -> None:
+        self._session.move(point)
+        self._show_target()
 
     def _add_panel(self) -> tuple[Any, list[Any]]:
         """Status, target, and what is shown; the words and the sliders."""
@@ -186,13 +166,7 @@ class Page:
 
     def _show_target(self) -> None:
         """Puts handle and sliders where the target is. Called in the server's own loop only, so in order."""
-        place = self._place(self._session.target)
-        if not np.allclose(self._handle.position, place, atol=1e-9):
-            self._handle.position = place
-        target = np.array(self._session.target)
-        # of what the target leaves open, the handle keeps its own
-        if self._session.roadmap.task.gap_of_few(np.array(self._point(self._handle)), target) > 1e-6:
-            self._handle.wxyz = self._turned(self._session.target)
+        self._handle.show(self._session.target)
         for slider, value in zip(self._sliders, self._session.target, strict=False):
             slider.value = float(np.clip(round(value, 3), slider.min, slider.max))
 
@@ -255,25 +229,6 @@ class Page:
     def _moved(self) -> dict[str, tuple[str, str]]:
         """The coordinates that can be moved one by one, which come first in a point, and their keys."""
         return {name: _KEYS[name] for name in self._session.roadmap.task.coordinates if name in _KEYS}
-
-    def _point(self, handle: Any) -> list[float]:
-        """The point of the task space that a handle is at."""
-        rotation = matrix_from_quaternion(torch.tensor(handle.wxyz, dtype=torch.float64))
-        position = torch.tensor(handle.position, dtype=torch.float64)
-        point: list[float] = self._session.roadmap.task.at(position[:, None], rotation[..., None])[:, 0].tolist()
-        return point
-
-    def _turned(self, point: tuple[float, ...]) -> np.ndarray:
-        """(4,) a quaternion of a handle at a point, any of those that the point leaves open."""
-        task = self._session.roadmap.task
-        if task.rotations is None:
-            return np.array([1.0, 0.0, 0.0, 0.0])
-        rotations = task.matrices(torch.tensor(point, dtype=torch.float64)[:, None])
-        if rotations is None:
-            assert isinstance(task, Axis)
-            rotations = torch.from_numpy(align_vectors(task.unit_axis, point[3:])[:3, :3, None])
-        quaternion: np.ndarray = quaternion_from_matrix(rotations[..., 0]).numpy()
-        return quaternion
 
     def _place(self, point: tuple[float, ...]) -> np.ndarray:
         """(3,) a point of the task space."""

@@ -22,7 +22,7 @@ from grr_torch.pieces import together
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
-from grr_torch.spaces.cliques import draw
+from grr_torch.spaces.cliques import are_closed, draw
 from grr_torch.spaces.configuration import difference, distance
 
 if TYPE_CHECKING:
@@ -78,6 +78,17 @@ def measure_cells(roadmap: Roadmap, corners: Tensor, progress: Progress = silent
     points, q = (part.to(robot.lower) for part in (roadmap.points, roadmap.configurations))
     spread = spreads(robot, roadmap.task, points, q, corners, tolerances, progress, kept)
     return Cells(corners, windings(roadmap, corners), spread.cpu())
+
+
+def doubtful_cells(roadmap: Roadmap) -> tuple[Tensor, Tensor]:
+    """Corners (C, 3) and (C, 4): cells that are not certified, and what would be cells if no edge were broken."""
+    graph, between = roadmap.graph, roadmap.resolved[roadmap.edges].all(1)
+    found: list[Tensor] = []
+    for cells, around in zip(roadmap.cells(), (graph.triangles, graph.faces), strict=True):
+        corners = around(between) if bool((between & ~roadmap.connected).any()) else cells.corners[:0]
+        broken = ~are_closed(corners, roadmap.edges[roadmap.connected], len(roadmap.points))
+        found.append(torch.cat([cells.corners[~cells.certified], corners[broken]]))
+    return found[0], found[1]
 
 
 def windings(roadmap: Roadmap, corners: Tensor) -> Tensor:

@@ -13,11 +13,10 @@ import torch
 from torch import Tensor
 
 from grr_torch.progress import Progress, silent
-from grr_torch.resolution.cells import Cells, measure_cells
+from grr_torch.resolution.cells import Cells, doubtful_cells, measure_cells
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.quality import Quality, measure_quality
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.cliques import are_closed
 from grr_torch.spaces.graph import TaskGraph, find_lattice
 from grr_torch.spaces.product import find_product
 from grr_torch.spaces.task import TaskSpace
@@ -153,13 +152,7 @@ class Roadmap:
         They are the cells that are not certified, and what would be cells if none of its edges were broken. Roadmap
         files hold them.
         """
-        between = self.resolved[self.edges].all(1)
-        found: list[Tensor] = []
-        for cells, around in zip(self.cells(), (self.graph.triangles, self.graph.faces), strict=True):
-            corners = around(between) if bool((between & ~self.connected).any()) else cells.corners[:0]
-            broken = ~are_closed(corners, self.edges[self.connected], len(self.points))
-            found.append(torch.cat([cells.corners[~cells.certified], corners[broken]]))
-        return found[0], found[1]
+        return doubtful_cells(self)
 
     @cached_property
     def solver(self) -> Solver:
