@@ -6,6 +6,7 @@ import warnings
 
 import pytest
 import torch
+from random_robots import BOX_ARM
 
 import grr_torch
 from grr_torch.errors import GrrWarning
@@ -60,16 +61,72 @@ def test_a_roadmap_without_edges_is_recorded(planar_5, tmp_path):
     assert (tmp_path / "one.rrd").stat().st_size > 0
 
 
-def test_meshes_that_are_gone_are_left_out_with_a_warning(tmp_path):
-    import trimesh
-    from random_robots import BOX_ARM
+@pytest.fixture
+def box_roadmap(tmp_path):
+    """A small roadmap of the box arm, after changes to its URDF."""
 
-    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "hand.stl")
-    path = tmp_path / "arm.urdf"
-    path.write_text(BOX_ARM.replace('<sphere radius="0.05"/>', '<mesh filename="hand.stl"/>'))
-    robot = grr_torch.load_robot(path)
-    task, bounds = grr_torch.Position(3), [(-0.5, 0.5)] * 2 + [(0.2, 0.9)]
-    roadmap = grr_torch.build(robot, task, points=60, bounds=bounds, seeds=[[0.0, 1.0, 0.5]])
+    def build(*changes):
+        import trimesh
+
+        trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "hand.stl")
+        path = tmp_path / "arm.urdf"
+        text = BOX_ARM
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        path.write_text(text)
+        task, bounds = grr_torch.Position(3), [(-0.5, 0.5)] * 2 + [(0.2, 0.9)]
+        robot = grr_torch.load_robot(path)
+        return grr_torch.build(robot, task, points=60, bounds=bounds, seeds=[[0.0, 1.0, 0.5]], refine=False)
+
+    return build
+
+
+BALL = '<collision><origin xyz="0 0 0.06"/><geometry><sphere radius="0.05"/></geometry></collision>'
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        (' effort="1" velocity="1"', ""),
+        ('<link name="tip"/>', '<link name="tip"><inertial><origin xyz="0 0 0"/></inertial></link>'),
+        ('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><safety_controller soft_lower_limit="1"/>'),
+        (BALL, '<visual><geometry><sphere radius="1"/></geometry><material><color rgba="1 0 0"/></material></visual>'),
+        (BALL, '<visual><geometry><mesh filename="hand.stl" scale="0.5"/></geometry></visual>'),
+    ],
+    ids=["limit without velocity", "inertia without mass", "safety", "colour of three numbers", "scale of one number"],
+)
+def test_a_urdf_that_is_read_is_displayed(box_roadmap, tmp_path, change):
+    """Displays have reasons to refuse a URDF that are none of the kinematics'."""
+    from grr_torch.interactive.scene import link_meshes
+
+    roadmap = box_roadmap(change)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        record_roadmap(roadmap, tmp_path / "r.rrd")
+        assert set(link_meshes(roadmap.robot)) == {"base", "upper", "fore", "hand"}
+    found = entities(tmp_path / "r.rrd")
+    assert "/robot/joints/elbow" in found
+    assert any("visual_geometries" in entity and "hand" in entity for entity in found)
+
+
+def test_a_robot_that_rerun_refuses_is_left_out_with_a_warning(run_cli, box_arm, tmp_path):
+    box_arm.write_text(BOX_ARM.replace('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><axis xyz="0 1 0"/>'))
+    options = ["--robot", box_arm, "--bounds", "-0.5 0.5 -0.5 0.5 0.2 0.9", "--points", "60", "--no-refine"]
+    code, _, errors = run_cli("build", *options, "--out", "r.grr")
+    assert code == 0
+    assert len(errors.splitlines()) == 1
+    assert errors.startswith("warning: the robot is left out of the recording: rerun cannot display its URDF:")
+    assert "duplicate field `axis`" in errors
+    roadmap = grr_torch.Roadmap.load(tmp_path / "r.grr")
+    assert bool(roadmap.resolved.any())
+    found = entities(tmp_path / "r.rrd")
+    assert {"/roadmap/connected", "/tour/path"} <= found
+    assert not any(entity.startswith("/robot") for entity in found)
+
+
+def test_meshes_that_are_gone_are_left_out_with_a_warning(box_roadmap, tmp_path):
+    roadmap = box_roadmap(('<sphere radius="0.05"/>', '<mesh filename="hand.stl"/>'))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         record_roadmap(roadmap, tmp_path / "with.rrd")
