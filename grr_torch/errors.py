@@ -77,10 +77,10 @@ class MeshNotFoundError(GrrError):
 
     def __init__(self, filename: str, link: str, searched: Sequence[Path]) -> None:
         self.filename, self.link, self.searched = filename, link, tuple(searched)
-        places = ", ".join(str(path) for path in searched) or "nowhere: no package folder was given"
+        places = ", ".join(str(path) for path in searched) or "nowhere: there is no folder to search"
         super().__init__(
             f"mesh '{filename}' of link '{link}' not found; looked at: {places}. "
-            "Folders to search for package:// names are given by --package-dir (package_dirs)."
+            "More folders to search for package:// names are given by --package-dir (package_dirs)."
         )
 
 

@@ -10,6 +10,7 @@ from random_robots import BOX_ARM
 
 import grr_torch
 from grr_torch.errors import GrrWarning
+from grr_torch.interactive.scene import link_meshes
 from grr_torch.recording.roadmap import record_roadmap
 from grr_torch.recording.tour import tour
 from grr_torch.spaces.configuration import normalise
@@ -98,8 +99,6 @@ BALL = '<collision><origin xyz="0 0 0.06"/><geometry><sphere radius="0.05"/></ge
 )
 def test_a_urdf_that_is_read_is_displayed(box_roadmap, tmp_path, change):
     """Displays have reasons to refuse a URDF that are none of the kinematics'."""
-    from grr_torch.interactive.scene import link_meshes
-
     roadmap = box_roadmap(change)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -125,11 +124,17 @@ def test_a_robot_that_rerun_refuses_is_left_out_with_a_warning(run_cli, box_arm,
     assert not any(entity.startswith("/robot") for entity in found)
 
 
-def test_meshes_that_are_gone_are_left_out_with_a_warning(box_roadmap, tmp_path):
+def test_meshes_that_are_gone_are_left_out_with_a_warning(box_roadmap, tmp_path, capfd):
     roadmap = box_roadmap(('<sphere radius="0.05"/>', '<mesh filename="hand.stl"/>'))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         record_roadmap(roadmap, tmp_path / "with.rrd")
     (tmp_path / "hand.stl").unlink()
-    with pytest.warns(GrrWarning, match=r"1 meshes are left out of the recording, not found: hand\.stl"):
+    with pytest.warns(
+        GrrWarning, match=r"meshes left out of the recording, not found: hand\.stl\..*--package-dir"
+    ) as warned:
         record_roadmap(roadmap, tmp_path / "without.rrd")
+    assert len(warned) == 1
+    with pytest.warns(GrrWarning, match=r"meshes left out of the page, not found: hand\.stl\."):
+        assert set(link_meshes(roadmap.robot)) == {"base", "upper", "fore"}
+    assert capfd.readouterr().err == ""  # neither display has more to say of them

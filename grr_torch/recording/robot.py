@@ -69,7 +69,7 @@ def displayable(robot: Robot, where: str) -> bytes:
     from lxml import etree
 
     root = etree.fromstring(robot.urdf.text.encode(), etree.XMLParser(resolve_entities=False, no_network=True))
-    missing: list[str] = []
+    missing: set[str] = set()
     for link in root.findall("link"):
         _keep(link, "visual" if link.find("visual") is not None else "collision")
         for shape in list(link):
@@ -77,7 +77,7 @@ def displayable(robot: Robot, where: str) -> bytes:
             try:
                 _complete_mesh(shape.find("geometry/mesh"), robot.urdf, link.get("name", ""))
             except MeshNotFoundError as error:
-                missing.append(error.filename)
+                missing.add(error.filename)
                 link.remove(shape)
     for joint in root.findall("joint"):
         _keep(joint, "parent", "child", "origin", "axis")
@@ -85,7 +85,10 @@ def displayable(robot: Robot, where: str) -> bytes:
             joint.set("type", "fixed")
     _complete_materials(root)
     if missing:
-        text = f"{len(missing)} meshes are left out of the {where}, not found: {', '.join(sorted(set(missing)))}"
+        text = (
+            f"meshes left out of the {where}, not found: {', '.join(sorted(missing))}. "
+            "Folders to search for package:// names are given by --package-dir (package_dirs of load_robot)"
+        )
         warnings.warn(text, GrrWarning, stacklevel=3)
     return bytes(etree.tostring(root))
 

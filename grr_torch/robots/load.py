@@ -38,7 +38,8 @@ def load_robot(
         name_or_path: A bundled name (`grr-torch robots` lists them) or the path of a URDF.
         tool: Link whose pose is controlled; by default the preset's, or the URDF's last link if it has one only.
         base: Link in whose frame poses are given; by default the preset's, or the URDF's root.
-        package_dirs: Folders in which `package://` mesh names are searched.
+        package_dirs: Folders in which `package://` mesh names are searched before those above the URDF. A mesh that is
+            missing is left out where the robot is shown.
         held_joints: Values [rad or m] of joints that do not move. Joints outside the chain stay at 0 by default.
         spheres: Sphere file or model; by default the preset's. A URDF without one is not checked for self-collision.
         margin: Distance [m] below which two links count as in collision; by default the preset's, or 0.
@@ -48,7 +49,6 @@ def load_robot(
     Raises:
         UnknownNameError: No such robot, link or joint; the known ones are listed.
         UrdfError: The URDF is malformed or has no movable joint between base and tool.
-        MeshNotFoundError: A mesh that it names is missing.
         FileFormatError: The sphere file is not one.
         ParameterError: No tool is given for a URDF with several ends, or a held value, the margin, the device or the
             dtype is not valid.
@@ -57,7 +57,6 @@ def load_robot(
         raise ParameterError("dtype", dtype, "torch.float64 or torch.float32")
     preset = _preset(name_or_path)
     urdf = read_urdf(preset.urdf if preset else name_or_path, package_dirs)
-    urdf.check_meshes()
     base = base or (preset.base if preset else urdf.root)
     tool = tool or (preset.tool if preset else _only_leaf(urdf))
     if spheres is None and preset is not None and preset.spheres is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -84,7 +85,7 @@ class Urdf:
         name: The robot's name.
         text: The XML it was read from.
         directory: Where relative mesh names start, or None when read from text alone.
-        package_dirs: Folders in which `package://` names are searched.
+        package_dirs: Folders in which `package://` names are searched before those above the URDF.
         root: The link that has no parent.
         links: Link names, in the file's order.
         joints: Joints by name, in the file's order.
@@ -135,42 +136,32 @@ class Urdf:
         return [link for link in self.links if link not in parents]
 
     def mesh_path(self, filename: str, link: str) -> Path:
-        """Finds a mesh: relative to the URDF, absolute, `file://`, or `package://` within `package_dirs`.
+        """Finds a mesh: relative to the URDF, absolute, `file://`, or `package://`.
+
+        A package is looked for in `package_dirs`, then in the folders above the URDF; each may be the package itself.
 
         Raises:
             MeshNotFoundError: It is in none of these places.
         """
-        candidates: list[Path] = []
         try:
             candidates = self._mesh_candidates(filename)
-            for candidate in candidates:
-                if candidate.is_file():
-                    return candidate
-        except (OSError, ValueError):  # no name that a file could have
-            pass
+        except ValueError:  # no name that a file could have
+            candidates = []
+        for candidate in candidates:
+            if os.path.isfile(candidate):
+                return candidate
         raise MeshNotFoundError(filename, link, candidates)
 
     def _mesh_candidates(self, filename: str) -> list[Path]:
         url = urlparse(filename)
         if url.scheme == "package":
             package, inside = unquote(url.netloc), unquote(url.path).lstrip("/")
+            above = () if self.directory is None else (self.directory, *self.directory.parents)
             # a package folder may be named itself, or the folder that holds it
             return [
                 path
-                for folder in self.package_dirs
+                for folder in (*self.package_dirs, *above)
                 for path in ([folder / inside] if folder.name == package else []) + [folder / package / inside]
             ]
         path = Path(unquote(url.path)) if url.scheme == "file" else Path(filename)
         return [path] if path.is_absolute() or self.directory is None else [self.directory / path]
-
-    def check_meshes(self) -> None:
-        """Looks every mesh up.
-
-        Raises:
-            MeshNotFoundError: For the first one that is missing.
-        """
-        for shapes in (self.collisions, self.visuals):
-            for link, of_link in shapes.items():
-                for shape in of_link:
-                    if shape.filename is not None:
-                        self.mesh_path(shape.filename, link)
