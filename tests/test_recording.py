@@ -77,7 +77,7 @@ def box_roadmap(tmp_path):
             text = text.replace(old, new)
         path.write_text(text)
         task, bounds = grr_torch.Position(3), [(-0.5, 0.5)] * 2 + [(0.2, 0.9)]
-        robot = grr_torch.load_robot(path)
+        robot = grr_torch.load_robot(path, tool="tip")
         return grr_torch.build(robot, task, points=60, bounds=bounds, seeds=[[0.0, 1.0, 0.5]], refine=False)
 
     return build
@@ -86,16 +86,27 @@ def box_roadmap(tmp_path):
 BALL = '<collision><origin xyz="0 0 0.06"/><geometry><sphere radius="0.05"/></geometry></collision>'
 
 
+FREE = '<link name="free"/><joint name="f" type="ball"><parent link="tip"/><child link="free"/></joint>'
+
+
 @pytest.mark.parametrize(
     "change",
     [
         (' effort="1" velocity="1"', ""),
         ('<link name="tip"/>', '<link name="tip"><inertial><origin xyz="0 0 0"/></inertial></link>'),
         ('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><safety_controller soft_lower_limit="1"/>'),
+        ("</robot>", FREE + "</robot>"),
         (BALL, '<visual><geometry><sphere radius="1"/></geometry><material><color rgba="1 0 0"/></material></visual>'),
         (BALL, '<visual><geometry><mesh filename="hand.stl" scale="0.5"/></geometry></visual>'),
     ],
-    ids=["limit without velocity", "inertia without mass", "safety", "colour of three numbers", "scale of one number"],
+    ids=[
+        "limit without velocity",
+        "inertia without mass",
+        "safety",
+        "joint of another type",
+        "colour of three numbers",
+        "scale of one number",
+    ],
 )
 def test_a_urdf_that_is_read_is_displayed(box_roadmap, tmp_path, change):
     """Displays have reasons to refuse a URDF that are none of the kinematics'."""
@@ -105,7 +116,7 @@ def test_a_urdf_that_is_read_is_displayed(box_roadmap, tmp_path, change):
         record_roadmap(roadmap, tmp_path / "r.rrd")
         assert set(link_meshes(roadmap.robot)) == {"base", "upper", "fore", "hand"}
     found = entities(tmp_path / "r.rrd")
-    assert "/robot/joints/elbow" in found
+    assert {"/robot/joints/elbow", "/tf_static"} <= found
     assert any("visual_geometries" in entity and "hand" in entity for entity in found)
 
 

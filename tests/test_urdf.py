@@ -67,6 +67,29 @@ def test_joints_outside_the_chain_are_held(load):
     assert math.atan2(held[1, 0], held[0, 0]) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("kind", ["floating", "planar", "ball"])
+@pytest.mark.parametrize("fault", ["", '<axis xyz="0 0 0"/>', '<mimic joint="j"/>'])
+def test_joints_of_other_types_outside_the_chain_are_held(load, kind, fault):
+    """Above the base and beside the chain; as if they were fixed, whatever else is written of them."""
+    other = HINGE.replace('<axis xyz="0 0 1"/>', '<origin xyz="0.1 0 0" rpy="0 1 0"/>')
+
+    def text(kind, fault):
+        ends = (("world", "w", "a"), ("side", "b", "c"))
+        others = "".join(other.format(n=name, t=kind, p=parent, c=child, x=fault) for name, parent, child in ends)
+        return robot_text(others, hinge("j", "a", "b"), hinge("k", "c", "d"), links="wabcd")
+
+    robot = load(text(kind, fault), base="a", tool="b")
+    assert robot.joint_names == ("j",)
+    q = torch.tensor([0.3], dtype=torch.float64)
+    fixed = load(text("fixed", ""), base="a", tool="b")
+    torch.testing.assert_close(robot.link_poses(q), fixed.link_poses(q), atol=0, rtol=0)
+    with pytest.raises(UnknownNameError, match=r"unknown joint 'side'. Known: j, k\."):
+        load(text(kind, fault), base="a", tool="b", held_joints={"side": 0.0})
+    for base, tool, joint in (("w", "b", "world"), ("a", "d", "side")):
+        with pytest.raises(UrdfError, match=f"joint '{joint}' is of type '{kind}'; supported: revolute"):
+            load(text(kind, fault), base=base, tool=tool)
+
+
 def test_a_held_joint_of_the_chain_is_no_degree_of_freedom(load):
     text = robot_text(hinge("i", "a", "b"), hinge("j", "b", "c"), links="abc")
     robot = load(text, held_joints={"i": 0.25})

@@ -17,7 +17,7 @@ from grr_torch.robots.presets import Preset, load_preset, robot_names
 from grr_torch.robots.read_urdf import read_urdf
 from grr_torch.robots.robot import Robot
 from grr_torch.robots.spheres import SphereModel
-from grr_torch.robots.urdf import Joint, Urdf
+from grr_torch.robots.urdf import MOVABLE_TYPES, Joint, Urdf
 
 
 def load_robot(
@@ -48,7 +48,7 @@ def load_robot(
 
     Raises:
         UnknownNameError: No such robot, link or joint; the known ones are listed.
-        UrdfError: The URDF is malformed or has no movable joint between base and tool.
+        UrdfError: The URDF is malformed, or between base and tool has no movable joint or one of a type not supported.
         FileFormatError: The sphere file is not one.
         ParameterError: No tool is given for a URDF with several ends, or a held value, the margin, the device or the
             dtype is not valid.
@@ -96,6 +96,7 @@ def make_robot(
     """Makes a `Robot` from a validated URDF; see `load_robot`."""
     held = _held(urdf, held_joints)
     path = urdf.path(base, tool)
+    _check_types(urdf, path)
     moving = degrees_of_freedom(path, held)
     if not moving:
         raise UrdfError(urdf.name, f"no movable joint between base '{base}' and tool '{tool}'")
@@ -167,6 +168,14 @@ def _held(urdf: Urdf, held_joints: Mapping[str, float]) -> dict[str, float]:
         if not math.isfinite(value) or not joint.lower <= value <= joint.upper:
             raise ParameterError(f"held joint '{name}'", value, f"{joint.lower} to {joint.upper}")
     return dict(held_joints)
+
+
+def _check_types(urdf: Urdf, path: Sequence[Joint]) -> None:
+    for joint in path:
+        if joint.kind not in (*MOVABLE_TYPES, "fixed"):
+            supported = f"supported: {', '.join(MOVABLE_TYPES)}, fixed"
+            chain = f"the chain from '{path[0].parent}' to '{path[-1].child}', outside of which it would be held"
+            raise UrdfError(urdf.name, f"joint '{joint.name}' is of type '{joint.kind}'; {supported} in {chain}")
 
 
 def _add_mimic(

@@ -12,18 +12,17 @@ from typing import Any
 import numpy as np
 
 from grr_torch.errors import UrdfError
-from grr_torch.robots.urdf import Joint, Shape, Urdf
+from grr_torch.robots.urdf import MOVABLE_TYPES, Joint, Shape, Urdf
 
 # metres beyond which an origin is a mistake
 _FARTHEST = 1e6
-SUPPORTED_TYPES = ("revolute", "continuous", "prismatic", "fixed")
 
 
 def read_urdf(path: str | os.PathLike[str], package_dirs: Sequence[str | os.PathLike[str]] = ()) -> Urdf:
     """Reads and validates a URDF file.
 
     Raises:
-        UrdfError: The file is missing, empty, malformed, or does not describe one tree of supported joints.
+        UrdfError: The file is missing, empty, malformed, or does not describe one tree of joints.
     """
     path = Path(path)
     try:
@@ -98,15 +97,14 @@ def _no_duplicates(source: str, kind: str, names: Sequence[str]) -> None:
 
 def _joint(parsed: Any, source: str) -> Joint:
     where = f"joint '{parsed.name}'"
-    if parsed.type not in SUPPORTED_TYPES:
-        raise UrdfError(source, f"{where} is of type '{parsed.type}'; supported: {', '.join(SUPPORTED_TYPES)}")
+    movable = parsed.type in MOVABLE_TYPES
     origin = np.eye(4) if parsed.origin is None else np.asarray(parsed.origin, dtype=np.float64)
     axis = np.asarray(parsed.axis, dtype=np.float64)
     length = float(np.linalg.norm(axis))
     if not (np.abs(origin) < _FARTHEST).all() or axis.shape != (3,) or not np.isfinite(length):
         raise UrdfError(source, f"{where}: its origin or axis is not finite")
     if length < 1e-9:
-        if parsed.type != "fixed":
+        if movable:
             raise UrdfError(source, f"{where} has an axis of length zero")
         axis, length = np.array([1.0, 0.0, 0.0]), 1.0
     lower, upper = _limits(parsed, where, source)
@@ -114,7 +112,7 @@ def _joint(parsed: Any, source: str) -> Joint:
     if velocity is not None and not velocity >= 0.0:
         raise UrdfError(source, f"{where} has a velocity limit of {velocity}; valid: 0 or more")
     mimic = None
-    if parsed.mimic is not None and parsed.type != "fixed":
+    if parsed.mimic is not None and movable:
         mimic = (parsed.mimic.joint, float(parsed.mimic.multiplier), float(parsed.mimic.offset))
         if not all(map(math.isfinite, mimic[1:])):
             raise UrdfError(source, f"{where} mimics with multiplier and offset {mimic[1:]}; valid: finite")
@@ -135,7 +133,7 @@ def _joint(parsed: Any, source: str) -> Joint:
 def _limits(parsed: Any, where: str, source: str) -> tuple[float, float]:
     """Position limits; a limit that is not written does not exist (a parser's 0 would freeze the joint)."""
     limit = parsed.limit
-    if parsed.type in ("continuous", "fixed") or limit is None or (limit.lower is None and limit.upper is None):
+    if parsed.type not in ("revolute", "prismatic") or limit is None or (limit.lower is None and limit.upper is None):
         return -math.inf, math.inf
     lower = 0.0 if limit.lower is None else float(limit.lower)
     upper = 0.0 if limit.upper is None else float(limit.upper)

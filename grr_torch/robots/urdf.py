@@ -17,6 +17,8 @@ from grr_torch.errors import MeshNotFoundError, UnknownNameError, UrdfError
 
 Matrix = npt.NDArray[np.float64]
 
+MOVABLE_TYPES = ("revolute", "continuous", "prismatic")
+
 
 @dataclass(frozen=True)
 class Joint:
@@ -24,7 +26,7 @@ class Joint:
 
     Attributes:
         name: Its name.
-        kind: "revolute", "continuous", "prismatic" or "fixed".
+        kind: "revolute", "continuous", "prismatic" or "fixed"; joints of other kinds do not move either.
         parent: Parent link.
         child: Child link.
         origin: (4, 4) pose of the joint's frame in the parent link's frame [m].
@@ -48,8 +50,8 @@ class Joint:
 
     @property
     def movable(self) -> bool:
-        """Whether the joint can move at all."""
-        return self.kind != "fixed"
+        """Whether the joint can have a value other than 0."""
+        return self.kind in MOVABLE_TYPES
 
 
 def sampling_range(kind: str, lower: float, upper: float) -> tuple[float, float]:
