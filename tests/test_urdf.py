@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 
 import pytest
@@ -144,6 +145,45 @@ def test_text_in_another_encoding_is_read(tmp_path):
 def test_a_margin_without_spheres_is_warned_of(load):
     with pytest.warns(GrrWarning, match="the margin has no effect"):
         load(robot_text(hinge("j", "a", "b")), margin=0.01)
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "complaint"),
+    [
+        ("revolute", '<limit lower="-180" upper="180" velocity="1"/>', "position limits beyond ±4π rad: .* degrees"),
+        ("revolute", '<limit lower="-12" upper="12.6" velocity="1"/>', "position limits beyond"),
+        ("revolute", '<limit lower="-12.6" velocity="1"/>', "position limits beyond"),
+        ("revolute", '<limit lower="-12.5" upper="12.5" velocity="1"/>', None),
+        ("revolute", '<limit lower="-inf" upper="inf" velocity="1"/>', None),
+        ("prismatic", '<limit lower="-180" upper="180" velocity="1"/>', None),
+        ("continuous", '<limit lower="-180" upper="180" velocity="1"/>', None),
+        ("revolute", '<limit velocity="1"/>', "no position limits .* taken as unlimited"),
+        ("prismatic", "", "no position limits .* taken as unlimited"),
+        ("revolute", '<limit lower="0" upper="0" velocity="1"/>', None),
+        ("revolute", '<limit upper="1" velocity="1"/>', None),
+        ("continuous", "", None),
+        ("revolute", '<limit lower="-1" upper="1" velocity="0"/>', "a velocity limit of 0: taken as none"),
+        ("continuous", '<limit velocity="0"/>', "a velocity limit of 0: taken as none"),
+        ("revolute", '<limit lower="-1" upper="1"/>', None),
+    ],
+)
+def test_limits_that_are_hardly_meant_are_warned_of_once(load, kind, limit, complaint):
+    text = robot_text(hinge("i", "a", "b", kind, limit), hinge("j", "b", "c", kind, limit), links="abc")
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        load(text)
+    assert len(warned) == (complaint is not None)
+    for warning in warned:
+        assert warning.category is GrrWarning
+        assert re.search(rf"robot\.urdf: {complaint}.* \(i, j\)$", str(warning.message))
+        assert warning.filename == __file__
+
+
+@pytest.mark.parametrize("name", grr_torch.robot_names())
+def test_bundled_robots_are_not_warned_of(name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grr_torch.load_robot(name)
 
 
 def test_base_may_lie_inside_the_tree(load):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -11,11 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from grr_torch.errors import UrdfError
+from grr_torch.errors import GrrWarning, UrdfError
 from grr_torch.robots.urdf import MOVABLE_TYPES, Joint, Shape, Urdf
 
 # metres beyond which an origin is a mistake
 _FARTHEST = 1e6
+# radians beyond which limits are likely to be degrees
+_FARTHEST_TURN = 4.0 * math.pi
+_LIMITED_TYPES = ("revolute", "prismatic")
 
 
 def read_urdf(path: str | os.PathLike[str], package_dirs: Sequence[str | os.PathLike[str]] = ()) -> Urdf:
@@ -49,7 +53,7 @@ def parse_urdf(
     _no_duplicates(source, "link", links)
     _no_duplicates(source, "joint", [joint.name for joint in parsed.joints])
     joints = {joint.name: _joint(joint, source) for joint in parsed.joints}
-    return Urdf(
+    urdf = Urdf(
         name=parsed.name,
         text=text,
         directory=directory,
@@ -60,6 +64,8 @@ def parse_urdf(
         collisions={link.name: _shapes(link.collisions, link.name, source) for link in parsed.links},
         visuals={link.name: _shapes(link.visuals, link.name, source) for link in parsed.links},
     )
+    _warn_of_limits(parsed.joints, source)
+    return urdf
 
 
 def _parse(data: bytes, source: str) -> tuple[Any, str]:
@@ -133,13 +139,37 @@ def _joint(parsed: Any, source: str) -> Joint:
 def _limits(parsed: Any, where: str, source: str) -> tuple[float, float]:
     """Position limits; a limit that is not written does not exist (a parser's 0 would freeze the joint)."""
     limit = parsed.limit
-    if parsed.type not in ("revolute", "prismatic") or limit is None or (limit.lower is None and limit.upper is None):
+    if parsed.type not in _LIMITED_TYPES or not _written(limit):
         return -math.inf, math.inf
     lower = 0.0 if limit.lower is None else float(limit.lower)
     upper = 0.0 if limit.upper is None else float(limit.upper)
     if not lower <= upper or lower == math.inf or upper == -math.inf:
         raise UrdfError(source, f"{where} has limits lower={lower}, upper={upper}; valid: lower ≤ upper")
     return lower, upper
+
+
+def _warn_of_limits(joints: Sequence[Any], source: str) -> None:
+    """Warns once of each kind of limit that is valid, and hardly what was meant."""
+    unwritten = [joint for joint in joints if joint.type in _LIMITED_TYPES and not _written(joint.limit)]
+    written = [joint for joint in joints if joint.type == "revolute" and _written(joint.limit)]
+    far = [
+        joint
+        for joint in written
+        if any(_FARTHEST_TURN < abs(bound or 0.0) < math.inf for bound in (joint.limit.lower, joint.limit.upper))
+    ]
+    still = [joint for joint in joints if joint.type in MOVABLE_TYPES and joint.limit and joint.limit.velocity == 0.0]
+    for found, text in (
+        (far, "position limits beyond ±4π rad: are they in degrees?"),
+        (unwritten, "no position limits (lower, upper): taken as unlimited, though URDF's default is 0 to 0"),
+        (still, "a velocity limit of 0: taken as none"),
+    ):
+        if found:
+            names = ", ".join(joint.name for joint in found)
+            warnings.warn(f"{source}: {text} ({names})", GrrWarning, stacklevel=5)
+
+
+def _written(limit: Any) -> bool:
+    return limit is not None and not (limit.lower is None and limit.upper is None)
 
 
 def _root(links: Sequence[str], joints: Mapping[str, Joint], source: str) -> str:
