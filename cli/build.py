@@ -8,7 +8,21 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from grr_torch.cli.show import ENGINES, numbers, print_json, print_rows, progress_bar, quality_rows, reports_errors
+from grr_torch.cli.arm import (
+    Axis,
+    Base,
+    Held,
+    Margin,
+    PackageDirs,
+    Rotation,
+    Spheres,
+    TaskKind,
+    Tool,
+    load_arm,
+    named_numbers,
+    read_turning,
+)
+from grr_torch.cli.show import ENGINES, print_json, print_rows, progress_bar, quality_rows, reports_errors
 
 from grr_torch.errors import ParameterError, UnknownNameError
 
@@ -16,9 +30,7 @@ from grr_torch.errors import ParameterError, UnknownNameError
 @reports_errors
 def build(
     robot: Annotated[str, typer.Option(help="A bundled robot (grr-torch robots) or the path of a URDF.")],
-    task: Annotated[
-        str | None, typer.Option(help="position, fixed-rotation, yaw, axis or pose; the preset's default.")
-    ] = None,
+    task: TaskKind = None,
     points: Annotated[int | None, typer.Option(help="Vertices that the staggered grid is asked for.")] = None,
     rotations: Annotated[
         int | None,
@@ -63,30 +75,17 @@ def build(
             help="Nearest vertices averaged over; 24 or 64. Where rotation varies, those so many edges away; 2."
         ),
     ] = None,
-    tool: Annotated[str | None, typer.Option(help="Link whose pose is controlled.")] = None,
-    base: Annotated[str | None, typer.Option(help="Link in whose frame points are given.")] = None,
+    tool: Tool = None,
+    base: Base = None,
     bounds: Annotated[
         str | None, typer.Option(help="Bounds of the grid, in metres.", metavar="X0 X1 Y0 Y1 [Z0 Z1]")
     ] = None,
-    rotation: Annotated[
-        str | None,
-        typer.Option(
-            help="Fixed-axis roll, pitch, yaw of the tool in radians, for fixed-rotation, and for yaw at yaw 0; 0 0 0 "
-            "without a preset.",
-            metavar="R P Y",
-        ),
-    ] = None,
-    axis: Annotated[
-        str | None,
-        typer.Option(
-            help="For yaw, what the tool turns about, in the base frame; for axis, the tool's axis, in its own; 0 0 1.",
-            metavar="X Y Z",
-        ),
-    ] = None,
-    package_dir: Annotated[list[Path] | None, typer.Option(help="Folder for package:// meshes; repeatable.")] = None,
-    hold: Annotated[list[str] | None, typer.Option(help="Hold a joint still; repeatable.", metavar="J=VALUE")] = None,
-    spheres: Annotated[Path | None, typer.Option(help="Sphere file for self-collision (grr-torch spheres).")] = None,
-    margin: Annotated[float | None, typer.Option(help="Added to every self-collision check, in metres.")] = None,
+    rotation: Rotation = None,
+    axis: Axis = None,
+    package_dir: PackageDirs = None,
+    hold: Held = None,
+    spheres: Spheres = None,
+    margin: Margin = None,
     checkpoint: Annotated[
         Path | None,
         typer.Option(help="Folder in which it is kept what is done, so that a build that was killed can go on."),
@@ -115,19 +114,18 @@ def build(
     from grr_torch.output import atomic_write, check_outputs
     from grr_torch.resolution.auto_seeds import CANDIDATES
     from grr_torch.resolution.build import build as build_roadmap
-    from grr_torch.resolution.problem import pose_problem
+    from grr_torch.resolution.problem import complete_task, pose_problem
     from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.stages import build_stages
-    from grr_torch.robots.load import load_robot
 
     with progress_bar() as progress, _edge_check(engine, address, device) as check:
         progress("loading the robot", 0, 1)
-        arm = load_robot(
+        arm = load_arm(
             robot,
             tool=tool,
             base=base,
-            package_dirs=package_dir or (),
-            held_joints=_held(hold or []),
+            package_dir=package_dir,
+            hold=hold,
             spheres=spheres,
             margin=margin,
             device=device,
@@ -137,10 +135,10 @@ def build(
         recording = None if no_record else record or out.parent / f"{out.stem}.rrd"
         check_outputs({"--out": out, "--record": recording}, [None if arm.preset else robot, seeds, spheres])
         box = None if bounds is None else _bounds(bounds)
-        rpy = None if rotation is None else numbers("--rotation", rotation, ("roll", "pitch", "yaw"))
-        about = None if axis is None else numbers("--axis", axis, ("x", "y", "z"))
-        problem = pose_problem(arm, _task(arm, task, box, rpy, about), points, box, _seeds(arm, seeds), rotations)
-        weights = _weights(objective or [])
+        axes = None if box is None else len(box)
+        space = complete_task(arm, task, axes, **read_turning(rotation, axis))
+        problem = pose_problem(arm, space, points, box, _seeds(arm, seeds), rotations)
+        weights = named_numbers("--objective", objective or (), "NAME=WEIGHT, a number of 0 or more")
         progress.foretell(
             build_stages(
                 problem.task,
@@ -240,21 +238,6 @@ def _seeds(arm: Any, seeds: str | None) -> Any:
     return read_seeds(seeds)
 
 
-def _task(
-    arm: Any,
-    kind: str | None,
-    box: list[tuple[float, float]] | None,
-    rotation: list[float] | None,
-    axis: list[float] | None,
-) -> Any:
-    """The task space that the options and the preset say."""
-    from grr_torch.resolution.problem import complete_task
-
-    if kind is None and arm.preset is None:
-        kind = "position" if rotation is None else "fixed-rotation"
-    return complete_task(arm, kind, None if box is None else len(box), rpy=rotation, axis=axis)
-
-
 def _bounds(text: str) -> list[tuple[float, float]]:
     try:
         values = [float(value) for value in text.replace(",", " ").split()]
@@ -263,24 +246,3 @@ def _bounds(text: str) -> list[tuple[float, float]]:
     if len(values) not in (4, 6):
         raise ParameterError("--bounds", repr(text), "four or six numbers: x0 x1 y0 y1 [z0 z1]")
     return list(zip(values[::2], values[1::2], strict=True))
-
-
-def _weights(items: list[str]) -> dict[str, float]:
-    return _named_numbers("--objective", items, "NAME=WEIGHT, a number of 0 or more")
-
-
-def _held(items: list[str]) -> dict[str, float]:
-    return _named_numbers("--hold", items, "JOINT=VALUE, the value in radians or metres")
-
-
-def _named_numbers(option: str, items: list[str], valid: str) -> dict[str, float]:
-    numbers: dict[str, float] = {}
-    for item in items:
-        name, _, value = item.partition("=")
-        if name in numbers:
-            raise ParameterError(option, repr(item), f"one value for '{name}'")
-        try:
-            numbers[name] = float(value)
-        except ValueError as error:
-            raise ParameterError(option, repr(item), valid) from error
-    return numbers

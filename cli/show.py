@@ -18,6 +18,9 @@ from grr_torch.progress import Outlook, Plan
 P = ParamSpec("P")
 R = TypeVar("R")
 
+# said in place of distances and shares
+NOT_CHECKED = "not checked: no sphere model"
+
 # where builds run
 ENGINES = ("local", "ray")
 
@@ -194,7 +197,7 @@ def quality_rows(quality: dict[str, Any]) -> list[tuple[str, str]]:
         ("largest rotation error", number("max_rotation_error", "rad", ".1e")),
         (
             "smallest self-collision distance",
-            number("min_self_collision_distance", "m", ".4f").replace("none", "not checked: no sphere model"),
+            number("min_self_collision_distance", "m", ".4f").replace("none", NOT_CHECKED),
         ),
         ("self-collisions", "not checked" if quality["self_collisions"] is None else str(quality["self_collisions"])),
         ("joint limit violations", str(quality["joint_limit_violations"])),

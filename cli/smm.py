@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from grr_torch.cli.show import markdown_table, numbers, print_json, progress_bar, reports_errors
+from grr_torch.cli.arm import (
+    Axis,
+    Base,
+    Held,
+    Margin,
+    PackageDirs,
+    Rotation,
+    Spheres,
+    TaskKind,
+    Tool,
+    load_arm,
+    read_turning,
+)
+from grr_torch.cli.show import NOT_CHECKED, markdown_table, print_json, progress_bar, reports_errors
 
 from grr_torch.errors import ParameterError
 
@@ -37,13 +49,9 @@ def smm(
             metavar="X Y [Z] …",
         ),
     ] = None,
-    task: Annotated[
-        str | None, typer.Option(help="position, fixed-rotation, yaw, axis or pose; the preset's default.")
-    ] = None,
-    rotation: Annotated[
-        str | None,
-        typer.Option(help="Fixed-axis roll, pitch, yaw of the tool in radians; the preset's.", metavar="R P Y"),
-    ] = None,
+    task: TaskKind = None,
+    rotation: Rotation = None,
+    axis: Axis = None,
     roadmap: Annotated[
         Path | None,
         typer.Option(help="Marks what this roadmap has there; for no --point, built if not given.", metavar="FILE.grr"),
@@ -53,9 +61,12 @@ def smm(
     samples: Annotated[int, typer.Option(help="Random starts, and most samples of what is no curve.")] = 1000,
     step: Annotated[float | None, typer.Option(help="Longest step, in radians; 0.05 on curves, else 0.3.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
-    tool: Annotated[str | None, typer.Option(help="Link whose pose is controlled.")] = None,
-    base: Annotated[str | None, typer.Option(help="Link in whose frame points are given.")] = None,
-    spheres: Annotated[Path | None, typer.Option(help="Sphere file for self-collision (grr-torch spheres).")] = None,
+    tool: Tool = None,
+    base: Base = None,
+    package_dir: PackageDirs = None,
+    hold: Held = None,
+    spheres: Spheres = None,
+    margin: Margin = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
 ) -> None:
     """Find all configurations that reach a point: the components of its self-motion manifold.
@@ -67,16 +78,19 @@ def smm(
     from grr_torch.applications.self_motion import roadmap_choice, self_motion_manifold
     from grr_torch.output import atomic_write, check_outputs
     from grr_torch.recording.self_motion import record_self_motion
-    from grr_torch.robots.load import load_robot
     from grr_torch.robots.presets import robot_names
 
     check_outputs({"--record": record, "--out": out}, [roadmap, None if robot in robot_names() else robot, spheres])
     with progress_bar() as progress:
-        given = None if robot is None else load_robot(robot, tool=tool, base=base, spheres=spheres)
-        turned = None if rotation is None else numbers("--rotation", rotation, ("roll", "pitch", "yaw"))
-        graph = _roadmap(roadmap, given, task, turned, bool(point), progress)
+        given = None
+        if robot is not None:
+            given = load_arm(
+                robot, tool=tool, base=base, package_dir=package_dir, hold=hold, spheres=spheres, margin=margin
+            )
+        turning = read_turning(rotation, axis)
+        graph = _roadmap(roadmap, given, task, turning, bool(point), progress)
         places = _triangle(graph) if graph is not None and not point else [_numbers(text) for text in point or []]
-        arm, space = (graph.robot, graph.task) if graph else (given, _task(given, places, task, turned))
+        arm, space = (graph.robot, graph.task) if graph else (given, _task(given, places, task, turning))
         assert arm is not None
         manifolds = [
             self_motion_manifold(arm, space, place, samples=samples, step=step, seed=seed, progress=progress)
@@ -103,7 +117,7 @@ def _roadmap(
     path: Path | None,
     arm: Robot | None,
     kind: str | None,
-    rotation: list[float] | None,
+    turning: dict[str, list[float] | None],
     has_points: bool,
     progress: Any,
 ) -> Roadmap | None:
@@ -117,8 +131,13 @@ def _roadmap(
             raise ParameterError("--robot", arm.name, f"{graph.robot.name}, the roadmap's, or none")
         if kind not in (None, graph.task.kind):
             raise ParameterError("--task", kind, f"{graph.task.kind}, the roadmap's, or none")
-        if rotation is not None and rotation != graph.task.to_json().get("rotation"):
-            raise ParameterError("--rotation", rotation, "the roadmap's, or none")
+        told = graph.task.to_json()
+        for option, values, own in (
+            ("--rotation", turning["rpy"], told.get("rotation")),
+            ("--axis", turning["axis"], told.get("axis")),
+        ):
+            if values not in (None, own):
+                raise ParameterError(option, values, "the roadmap's, or none")
         return graph
     if arm is None:
         raise ParameterError("--robot", "nothing", "a bundled robot, the path of a URDF, or --roadmap")
@@ -126,8 +145,9 @@ def _roadmap(
         return None
     if arm.preset is None:
         raise ParameterError("--point", "nothing", f"a point, or --roadmap: {arm.name} has no preset")
-    if rotation is not None:
-        raise ParameterError("--rotation", rotation, "none without --point: the preset's is taken")
+    for option, values in (("--rotation", turning["rpy"]), ("--axis", turning["axis"])):
+        if values is not None:
+            raise ParameterError(option, values, "none without --point: the preset's is taken")
     problem = arm.preset.problems.get(kind or arm.preset.default_task)
     coarse = problem is not None and len(problem.bounds) == 2
     return build(arm, kind, points=_VERTICES if coarse else None, progress=progress)
@@ -161,25 +181,23 @@ def _numbers(text: str) -> list[float]:
 
 
 def _task(
-    arm: Robot | None, places: list[list[float]], kind: str | None, rotation: Sequence[float] | None
+    arm: Robot | None, places: list[list[float]], kind: str | None, turning: dict[str, list[float] | None]
 ) -> TaskSpace:
-    """The task space that the options ask for, with the preset's rotation where none is given."""
-    from grr_torch.spaces.task import FixedRotation, Pose, make_task
+    """The task space that the options and the preset say, of as many axes as the points have."""
+    from grr_torch.resolution.problem import complete_task
+    from grr_torch.spaces.task import Pose
 
-    preset = arm.preset if arm else None
-    kind = kind or (FixedRotation.kind if rotation else preset.default_task if preset else "position")
+    assert arm is not None
     # x y yaw is a pose in the plane
-    dimension = 2 if len(places[0]) == 2 or (len(places[0]) == 3 and kind == Pose.kind) else 3
-    problem = preset.problems.get(kind) if preset else None
-    if rotation is None and problem is not None and len(problem.bounds) == dimension:
-        rotation = problem.rotation
-    return make_task(kind, dimension, rotation)
+    plane = len(places[0]) == 2 or (len(places[0]) == 3 and kind == Pose.kind)
+    return complete_task(arm, kind, 2 if plane else 3, **turning)
 
 
 def _figures(manifold: SelfMotionManifold, choice: Tensor | None) -> dict[str, Any]:
     """What is printed of a manifold."""
     counts = manifold.component.bincount(minlength=manifold.components).tolist()
     names, ranges = manifold.robot.joint_names, manifold.ranges().tolist()
+    checked = manifold.robot.spheres is not None
     return {
         "point": manifold.point.tolist(),
         "dimension": manifold.dimension,
@@ -187,7 +205,7 @@ def _figures(manifold: SelfMotionManifold, choice: Tensor | None) -> dict[str, A
             {
                 "samples": counts[c],
                 "closed": bool(manifold.closed[c]) if manifold.dimension == 1 else None,
-                "free": float(manifold.free[manifold.component == c].double().mean()),
+                "free": float(manifold.free[manifold.component == c].double().mean()) if checked else None,
                 "ranges": dict(zip(names, ranges[c], strict=True)),
             }
             for c in range(manifold.components)
@@ -208,7 +226,7 @@ def _print(manifold: SelfMotionManifold, choice: Tensor | None) -> None:
             f"{number + 1}{' *' if number == figures['roadmap_component'] else ''}",
             f"{part['samples']:,}",
             {True: "closed", False: "open", None: "no curve"}[part["closed"]],
-            f"{100.0 * part['free']:.1f} %",
+            NOT_CHECKED if part["free"] is None else f"{100.0 * part['free']:.1f} %",
             *(f"{low:.2f} … {high:.2f}" for low, high in part["ranges"].values()),
         ]
         for number, part in enumerate(figures["components"])

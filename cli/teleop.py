@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from grr_torch.cli.show import print_json, print_rows, progress_bar, reports_errors
+from grr_torch.cli.show import NOT_CHECKED, print_json, print_rows, progress_bar, reports_errors
 
 if TYPE_CHECKING:
     from grr_torch.applications.teleoperation_log import Summary, TeleoperationLog
@@ -122,7 +122,7 @@ def _write(log: TeleoperationLog, record: Path | None, out: Path | None) -> None
 
 def _rows(summary: Summary) -> list[tuple[str, str]]:
     shares = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in summary.shares.items() if share)
-    clearance = "not checked: no sphere model" if summary.clearance is None else f"{1e3 * summary.clearance:.1f} mm"
+    clearance = NOT_CHECKED if summary.clearance is None else f"{1e3 * summary.clearance:.1f} mm"
     deviations = (summary.deviation, summary.largest_deviation, summary.final_deviation)
     turns = [math.degrees(t) for t in (summary.turn, summary.largest_turn, summary.final_turn) if t is not None]
     return [

@@ -15,7 +15,7 @@ from grr_torch.robots.presets import Problem as Preset
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph, staggered_grid
 from grr_torch.spaces.product import ProductGraph, product_graph
-from grr_torch.spaces.task import KINDS, TaskSpace, make_task
+from grr_torch.spaces.task import KINDS, FixedRotation, Position, TaskSpace, make_task
 
 
 class Problem(NamedTuple):
@@ -66,19 +66,20 @@ def complete_task(
 
     Args:
         robot: The robot.
-        kind: The kind of task; by default the preset's.
+        kind: The kind of task; by default the preset's, but fixed rotation where one is given, and position without a
+            preset.
         axes: Of the grid, 2 or 3; by default as many as the preset has bounds for.
         rpy: As `make_task` takes it; by default the preset's, if that has as many axes.
         axis: As `make_task` takes it.
 
     Raises:
         UnknownNameError: No such kind, or none that the preset says the bounds of.
-        ParameterError: No kind or no bounds are given and there is no preset, or what is said excludes itself.
+        ParameterError: No bounds are given and there is no preset, or what is said excludes itself.
     """
     preset = robot.preset
-    if kind is None and preset is None:
-        raise ParameterError("task", "nothing", f"{', '.join(KINDS)}: {robot.name} has no preset")
-    kind = kind or (preset.default_task if preset else "")
+    if kind is None:
+        without = preset.default_task if preset else Position.kind
+        kind = without if rpy is None else FixedRotation.kind
     problem = preset.problems.get(kind) if preset else None
     if axes is None and problem is None:
         if preset is not None or kind not in KINDS:

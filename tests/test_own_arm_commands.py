@@ -1,0 +1,66 @@
+"""What commands do with an arm of one's own, of which there is nothing but a URDF."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+# two ends, and a mesh in a package
+TWO_ENDS = """<robot name="two_ends">
+  <link name="base"><visual><geometry><mesh filename="package://arms/base.stl"/></geometry></visual></link>
+  <link name="upper"/><link name="fore"/><link name="wrist"/><link name="palm"/><link name="hand"/>
+  <link name="flange"/><link name="camera"/>
+  <joint name="turn" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/></joint>
+  <joint name="shoulder" type="revolute"><parent link="upper"/><child link="fore"/>
+    <origin xyz="0 0 0.2"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+  <joint name="elbow" type="revolute"><parent link="fore"/><child link="wrist"/>
+    <origin xyz="0 0 0.4"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+  <joint name="bend" type="revolute"><parent link="wrist"/><child link="hand"/>
+    <origin xyz="0 0 0.3"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+  <joint name="roll" type="continuous"><parent link="hand"/><child link="palm"/><axis xyz="0 0 1"/></joint>
+  <joint name="end" type="fixed"><parent link="palm"/><child link="flange"/><origin xyz="0.1 0 0.1"/></joint>
+  <joint name="mount" type="fixed"><parent link="fore"/><child link="camera"/></joint>
+</robot>
+"""
+
+
+@pytest.fixture
+def two_ends(tmp_path):
+    (tmp_path / "packages" / "arms").mkdir(parents=True)
+    (tmp_path / "packages" / "arms" / "base.stl").touch()
+    path = tmp_path / "two_ends.urdf"
+    path.write_text(TWO_ENDS)
+    return path
+
+
+def test_smm_loads_robots_as_build_does(run_cli, two_ends):
+    words = ("smm", "--robot", two_ends, "--point", 0.4, 0.1, 0.5, "--samples", 20)
+    code, _, complaint = run_cli(*words, "--tool", "flange")
+    assert code == 2
+    assert "--package-dir" in complaint
+    words = (*words, "--tool", "flange", "--package-dir", "packages", "--hold", "bend=0.3")
+    code, shown, complaint = run_cli(*words, "--json")
+    assert code == 0, complaint
+    assert set(json.loads(shown)["points"][0]["components"][0]["ranges"]) == {"turn", "shoulder", "elbow", "roll"}
+    assert run_cli(*words, "--hold", "bend=1")[2] == "error: --hold: got 'bend=1'; valid: one value for 'bend'\n"
+
+
+def test_smm_takes_an_axis(run_cli):
+    words = ("smm", "--robot", "kinova", "--task", "axis", "--samples", 20, "--json", "--point", 0.4, 0.1, 0.4, 0, 0, 1)
+    code, shown, complaint = run_cli(*words, "--axis", 0, 1, 0)
+    assert code == 0, complaint
+    assert json.loads(shown)["task"]["axis"] == [0.0, 1.0, 0.0]
+    assert run_cli(*words[:-7], "--axis", 0, 1, 0)[2].startswith("error: --axis: got [0.0, 1.0, 0.0]; valid: none")
+
+
+def test_smm_does_not_call_free_what_is_not_checked(run_cli):
+    words = ("--samples", 10, "--point", 0.2, 0.1)
+    shown = run_cli("smm", "--robot", "planar_5", *words)[1]
+    assert "not checked: no sphere model" in shown
+    assert "%" not in shown
+    assert (
+        json.loads(run_cli("smm", "--robot", "planar_5", *words, "--json")[1])["points"][0]["components"][0]["free"]
+        is None
+    )
+    assert "%" in run_cli("smm", "--robot", "kinova", "--samples", 10, "--point", 0.4, 0.1, 0.4)[1]
