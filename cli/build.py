@@ -22,7 +22,16 @@ from grr_torch.cli.arm import (
     named_numbers,
     read_turning,
 )
-from grr_torch.cli.show import ENGINES, print_json, print_rows, progress_bar, quality_rows, reports_errors
+from grr_torch.cli.show import (
+    ENGINES,
+    bounds_of,
+    bounds_row,
+    print_json,
+    print_rows,
+    progress_bar,
+    quality_rows,
+    reports_errors,
+)
 
 from grr_torch.errors import ParameterError, UnknownNameError
 
@@ -115,6 +124,7 @@ def build(
     from grr_torch.resolution.auto_seeds import CANDIDATES
     from grr_torch.resolution.build import build as build_roadmap
     from grr_torch.resolution.problem import complete_task, pose_problem
+    from grr_torch.resolution.quality import part_sizes
     from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.stages import build_stages
 
@@ -185,11 +195,11 @@ def build(
 
                 record_roadmap(roadmap, stack.enter_context(atomic_write(recording)))
         progress("writing", 2, 2)
-    quality = figures.to_dict()
+    quality, parts = figures.to_dict(), part_sizes(roadmap)
     if as_json:
         files = {"out": str(out), "record": None if recording is None else str(recording)}
-        told = {"refinement": roadmap.parameters.get("refinement")}
-        print_json({**quality, "build_seconds": roadmap.build_seconds, **told, **files})
+        told = {"bounds": bounds_of(roadmap), "refinement": roadmap.parameters.get("refinement")}
+        print_json({**quality, "parts": parts, "build_seconds": roadmap.build_seconds, **told, **files})
         return
     rotation = roadmap.task.to_json().get("rotation")
     turned = "" if rotation is None else f", roll pitch yaw {' '.join(f'{angle:.4g}' for angle in rotation)} rad"
@@ -202,7 +212,7 @@ def build(
         ("built in", f"{roadmap.build_seconds:.2f} s (the algorithm alone)"),
         ("written", written),
     ]
-    print_rows(title, [*quality_rows(quality), *rows])
+    print_rows(title, [bounds_row(roadmap), *quality_rows(quality, parts), *rows])
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from grr_torch.cli.show import print_json, print_rows, progress_bar, quality_rows, reports_errors
+from grr_torch.cli.show import bounds_row, print_json, print_rows, progress_bar, quality_rows, reports_errors
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,7 +38,7 @@ def info(
     Example: grr-torch info kinova.grr --verify
     """
     from grr_torch.errors import ParameterError
-    from grr_torch.resolution.quality import Quality, left_out_edges, steep_edges
+    from grr_torch.resolution.quality import Quality, left_out_edges, part_sizes, steep_edges
     from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.roadmap_file import load_roadmap, read_file
     from grr_torch.resolution.verify import verify_file
@@ -48,6 +48,7 @@ def info(
     metadata = read_file(file)[0]
     roadmap = load_roadmap(file)
     quality: dict[str, Any] = metadata["quality"]
+    parts = part_sizes(roadmap)
     checks = []
     if verify:
         with progress_bar() as progress:
@@ -59,6 +60,7 @@ def info(
         seeds = roadmap.parameters.get("seeds", ())
         data = {
             **quality,
+            "parts": parts,
             "build_seconds": roadmap.build_seconds,
             "robot": robot.name,
             "tool": robot.tool,
@@ -87,7 +89,8 @@ def info(
                 if spheres
                 else "none",
             ),
-            *quality_rows(quality),
+            bounds_row(roadmap),
+            *quality_rows(quality, parts),
             ("built in", f"{roadmap.build_seconds:.2f} s by grr-torch {metadata.get('package_version')}"),
         ]
         figures = Quality(**{field.name: quality[field.name] for field in fields(Quality)})

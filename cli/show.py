@@ -8,18 +8,24 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, ParamSpec, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TextIO, TypeVar
 
 import typer
 
 from grr_torch.errors import GrrError, GrrWarning, ParameterError
 from grr_torch.progress import Outlook, Plan
 
+if TYPE_CHECKING:
+    from grr_torch.resolution.roadmap import Roadmap
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
 # said in place of distances and shares
 NOT_CHECKED = "not checked: no sphere model"
+
+# connected parts whose sizes are listed
+_PARTS = 5
 
 # where builds run
 ENGINES = ("local", "ray")
@@ -142,6 +148,27 @@ def _cells_row(name: str, quality: dict[str, Any]) -> tuple[str, str]:
     return f"certified {name}", text
 
 
+def _parts(sizes: Sequence[int]) -> str:
+    """The sizes of connected parts, the largest first."""
+    if len(sizes) < 2:
+        return f"1: all {sizes[0]:,} vertices" if sizes else "none"
+    listed, rest = sizes[:_PARTS], sizes[_PARTS:]
+    more = f", and {len(rest):,} more of {sum(rest):,} in all" if rest else ""
+    text = ", ".join(f"{size:,}" for size in listed)
+    return f"{len(sizes):,}: {text} vertices{more}; no path leads from one to another"
+
+
+def bounds_of(roadmap: Roadmap) -> list[list[float]]:
+    """[low, high] of the roadmap's points along each axis [m]."""
+    low, high = roadmap.positions.aminmax(dim=0)
+    return [list(side) for side in zip(low.tolist(), high.tolist(), strict=True)]
+
+
+def bounds_row(roadmap: Roadmap) -> tuple[str, str]:
+    """Where the roadmap lies, as --bounds takes it."""
+    return "bounds", " ".join(f"{end:.6g}" for side in bounds_of(roadmap) for end in side) + " m"
+
+
 def numbers(option: str, text: str, names: Sequence[str]) -> list[float]:
     """The numbers that an option takes, one for each name.
 
@@ -166,8 +193,8 @@ def markdown_table(head: list[str], rows: list[list[str]]) -> str:
     )
 
 
-def quality_rows(quality: dict[str, Any]) -> list[tuple[str, str]]:
-    """The figures of `Roadmap.quality()` for people."""
+def quality_rows(quality: dict[str, Any], parts: Sequence[int]) -> list[tuple[str, str]]:
+    """The figures of `Roadmap.quality()` for people, and the sizes of the roadmap's connected parts."""
 
     def share(name: str) -> str:
         return "not measured" if quality[name] is None else f"{100.0 * quality[name]:.2f} %"
@@ -186,6 +213,7 @@ def quality_rows(quality: dict[str, Any]) -> list[tuple[str, str]]:
         ("connected edges", f"{quality['connected_edges']:,}{of_edges}"),
         ("connectivity", share("connectivity")),
         ("connectivity, resolved edges only", share("connectivity_resolved")),
+        ("connected parts", _parts(parts)),
         ("smoothness", number("smoothness", "rad/m")),
         (
             "  median, 99 %, largest",

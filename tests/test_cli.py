@@ -59,7 +59,7 @@ def test_build_writes_a_roadmap_and_a_recording_and_prints_one_object(built):
     folder, result = built
     assert result.returncode == 0, result.stderr
     data = json.loads(result.stdout)
-    assert set(data) == QUALITY | {"build_seconds", "refinement", "out", "record"}
+    assert set(data) == QUALITY | {"parts", "bounds", "build_seconds", "refinement", "out", "record"}
     assert (data["out"], data["record"]) == ("planar_5.grr", "planar_5.rrd")
     assert sorted(path.name for path in folder.iterdir()) == ["planar_5.grr", "planar_5.rrd"]
     stored = grr_torch.Roadmap.load(folder / "planar_5.grr").quality().to_dict()
@@ -74,7 +74,7 @@ def test_info_shows_verifies_and_speaks_json(built):
     verified = run("info", "planar_5.grr", "--verify", "--json", cwd=folder)
     data = json.loads(verified.stdout)
     assert data["verified"] is True
-    assert set(data) >= QUALITY
+    assert set(data) >= QUALITY | {"parts"}
 
 
 def test_info_verify_catches_an_edited_file(built, tmp_path):
