@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from grr_torch.robots.robot import Robot
 
 TaskKind = Annotated[
-    str | None, typer.Option(help="position, fixed-rotation, yaw, axis or pose; the preset's default.")
+    str | None, typer.Option(help="position, fixed-rotation, yaw, axis or pose; the preset's default, or position.")
 ]
 Rotation = Annotated[
     str | None,

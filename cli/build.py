@@ -40,7 +40,12 @@ from grr_torch.errors import ParameterError, UnknownNameError
 def build(
     robot: Annotated[str, typer.Option(help="A bundled robot (grr-torch robots) or the path of a URDF.")],
     task: TaskKind = None,
-    points: Annotated[int | None, typer.Option(help="Vertices that the staggered grid is asked for.")] = None,
+    points: Annotated[
+        int | None,
+        typer.Option(
+            help="Vertices that the staggered grid is asked for; without a preset 1,000 in the plane, else 3,000."
+        ),
+    ] = None,
     rotations: Annotated[
         int | None,
         typer.Option(help="Rotations of the grid, where rotation varies: yaws, directions or orientations."),
@@ -87,7 +92,11 @@ def build(
     tool: Tool = None,
     base: Base = None,
     bounds: Annotated[
-        str | None, typer.Option(help="Bounds of the grid, in metres.", metavar="X0 X1 Y0 Y1 [Z0 Z1]")
+        str | None,
+        typer.Option(
+            help="Bounds of the grid, in metres; without a preset, what holds all that the arm reaches.",
+            metavar="X0 X1 Y0 Y1 [Z0 Z1]",
+        ),
     ] = None,
     rotation: Rotation = None,
     axis: Axis = None,
@@ -117,8 +126,10 @@ def build(
 
     Example: grr-torch build --robot kinova --points 1000000 --no-record --checkpoint kinova_1m --resume
 
-    Example: grr-torch build --robot arm.urdf --tool flange --task position --points 2000
-    --bounds -0.8 0.8 -0.8 0.8 0 1.2 --seeds seeds.csv
+    Example: grr-torch build --robot arm.urdf --tool flange
+
+    Example: grr-torch build --robot arm.urdf --tool flange --points 2000 --bounds -0.8 0.8 -0.8 0.8 0 1.2
+    --seeds seeds.csv
     """
     from grr_torch.output import atomic_write, check_outputs
     from grr_torch.resolution.auto_seeds import CANDIDATES

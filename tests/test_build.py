@@ -213,11 +213,6 @@ def test_an_unknown_task_lists_the_known(kinova):
         grr_torch.build(kinova, "rotation")
 
 
-def test_a_robot_without_preset_must_be_told_everything(box_arm):
-    with pytest.raises(ParameterError, match="points and bounds: got nothing"):
-        grr_torch.build(grr_torch.load_robot(box_arm), "position")
-
-
 def test_unknown_seeds_and_methods_are_errors(planar_5):
     with pytest.raises(UnknownNameError, match="auto"):
         grr_torch.build(planar_5, "position", seeds="abc")

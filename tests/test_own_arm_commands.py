@@ -6,6 +6,8 @@ import json
 
 import pytest
 
+from grr_torch import Roadmap
+
 # two ends, and a mesh in a package
 TWO_ENDS = """<robot name="two_ends">
   <link name="base"><visual><geometry><mesh filename="package://arms/base.stl"/></geometry></visual></link>
@@ -64,3 +66,19 @@ def test_smm_does_not_call_free_what_is_not_checked(run_cli):
         is None
     )
     assert "%" in run_cli("smm", "--robot", "kinova", "--samples", 10, "--point", 0.4, 0.1, 0.4)[1]
+
+
+def test_an_arm_is_built_from_its_urdf_and_tool_alone(run_cli, two_ends):
+    words = ("build", "--robot", two_ends, "--package-dir", "packages", "--no-record")
+    assert run_cli(*words)[2] == (
+        "error: tool: got nothing; valid: one of the links (--tool), as the URDF has several ends: flange, camera\n"
+    )
+    code, shown, complaint = run_cli(*words, "--tool", "flange", "--no-refine")
+    assert (code, complaint) == (0, "")
+    # limbs of 0.4, 0.3 and 0.1 that turn 2 rad each, and 0.1 to the side
+    assert "\nbounds                             -0.9 0.9 -0.9 0.9 -0.5 1.1 m\n" in shown
+    assert "two_ends, position in R3\n" in shown
+    assert "connected parts" in shown
+    roadmap = Roadmap.load("two_ends.grr")
+    assert len(roadmap.points) >= 3000
+    assert bool(roadmap.resolved.any())

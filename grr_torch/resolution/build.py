@@ -59,8 +59,8 @@ def build(
 ) -> Roadmap:
     """Builds a roadmap with Expansion-GRR, or with the baseline Random-GRR, and refines it.
 
-    Whatever is not given is taken from the preset of a bundled robot; without one, task, bounds and points must be
-    given, and seeds are found.
+    Whatever is not given is taken from the preset of a bundled robot. Without one, the task is position, the bounds
+    hold what the arm reaches, 1,000 points in the plane or 3,000 in space are asked for, and seeds are found.
 
     Args:
         robot: The robot.

@@ -6,16 +6,17 @@ import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import torch
-
 from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError
-from grr_torch.resolution.reachability import reach, within_reach
+from grr_torch.resolution.reachability import reach, reach_box, stays_in_plane, stays_upright, within_reach
 from grr_torch.resolution.seeds import SeedsLike
 from grr_torch.robots.presets import Problem as Preset
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.graph import Bounds, TaskGraph, staggered_grid
+from grr_torch.spaces.graph import Bounds, TaskGraph, check_bounds, staggered_grid
 from grr_torch.spaces.product import ProductGraph, product_graph
-from grr_torch.spaces.task import KINDS, FixedRotation, Position, TaskSpace, make_task
+from grr_torch.spaces.task import FixedRotation, Position, TaskSpace, make_task
+
+# vertices of the grid where neither they nor a preset say how many, by its axes
+_POINTS = {2: 1000, 3: 3000}
 
 
 class Problem(NamedTuple):
@@ -42,6 +43,8 @@ def pose_problem(
 ) -> Problem:
     """Task, graph and seeds, with what was not given taken from the robot's preset; as `build` takes them.
 
+    Without a preset the task is position, the bounds hold what the arm reaches, and seeds are found.
+
     Raises:
         UnknownNameError: No such task or seeds.
         ParameterError: Something is missing, does not fit the robot, or lies beyond its reach.
@@ -50,7 +53,8 @@ def pose_problem(
         raise ParameterError("robot", repr(robot), "a Robot, such as load_robot('kinova') gives")
     problem = _complete(robot, task, points, bounds, seeds, rotations)
     check_task(robot, problem.task)
-    _check_reach(robot, problem.task, problem.graph, warn=not isinstance(points, TaskGraph))
+    own_graph = isinstance(points, TaskGraph)
+    _check_reach(robot, problem.task, problem.graph, warn=not own_graph)
     return problem
 
 
@@ -68,13 +72,14 @@ def complete_task(
         robot: The robot.
         kind: The kind of task; by default the preset's, but fixed rotation where one is given, and position without a
             preset.
-        axes: Of the grid, 2 or 3; by default as many as the preset has bounds for.
+        axes: Of the grid, 2 or 3; by default as many as the preset has bounds for, without one 2 for arms whose tool
+            stays in a plane.
         rpy: As `make_task` takes it; by default the preset's, if that has as many axes.
         axis: As `make_task` takes it.
 
     Raises:
         UnknownNameError: No such kind, or none that the preset says the bounds of.
-        ParameterError: No bounds are given and there is no preset, or what is said excludes itself.
+        ParameterError: What is said excludes itself.
     """
     preset = robot.preset
     if kind is None:
@@ -82,9 +87,9 @@ def complete_task(
         kind = without if rpy is None else FixedRotation.kind
     problem = preset.problems.get(kind) if preset else None
     if axes is None and problem is None:
-        if preset is not None or kind not in KINDS:
-            raise UnknownNameError("task", kind, tuple(preset.problems) if preset else KINDS)
-        raise ParameterError("bounds", "nothing", f"(low, high) of each axis, and points: {robot.name} has no preset")
+        if preset is not None:
+            raise UnknownNameError("task", kind, tuple(preset.problems))
+        axes = 2 if stays_in_plane(robot) else 3
     axes = axes or (len(problem.bounds) if problem else 0)
     if rpy is None and problem is not None and len(problem.bounds) == axes:
         rpy = problem.rotation
@@ -96,7 +101,8 @@ def _turned(task: TaskSpace, positions: TaskGraph, rotations: int | None, proble
     if rotations is None and problem is not None:
         rotations = problem.rotations
     if rotations is None:
-        raise ParameterError("rotations", "nothing", f"how many rotations the grid of the task '{task.kind}' has")
+        valid = f"how many rotations the grid of the task '{task.kind}' has (--rotations)"
+        raise ParameterError("rotations", "nothing", valid)
     if positions.points.shape[1] != task.dimension:
         given = f"{positions.points.shape[1]} coordinates"
         raise ParameterError("points", given, f"{task.dimension}: positions, or a product_graph")
@@ -109,13 +115,10 @@ def check_task(robot: Robot, task: TaskSpace) -> None:
     Raises:
         ParameterError: An SE(2) task for a robot that leaves the plane, or a task in space for one that does not.
     """
-    position, rotation = robot.forward_kinematics(robot.sample(64, torch.Generator().manual_seed(0)))
-    upright = bool(((rotation[:, 2, 2].abs() - 1.0).abs() < 1e-5).all())
-    flat = upright and bool((position[:, 2] - position[0, 2]).abs().max() < 1e-5)
     given = f"{task.kind} in {task.name}"
-    if task.dimension == 2 and task.constraints > 2 and not upright:
+    if task.dimension == 2 and task.constraints > 2 and not stays_upright(robot):
         raise ParameterError("task", given, f"SE(3) for {robot.name}, whose tool leaves the plane")
-    if task.dimension == 3 and flat:
+    if task.dimension == 3 and stays_in_plane(robot):
         raise ParameterError("task", given, f"two axes for {robot.name}, whose tool stays in a plane")
 
 
@@ -149,14 +152,7 @@ def _complete(
     problem = preset.problems.get(kind or "") if preset else None
     if isinstance(task, str) and preset and problem is None and bounds is None:
         raise UnknownNameError("task", task, tuple(preset.problems))
-    if bounds is None and problem is not None:
-        bounds = problem.bounds
-    if points is None and problem is not None:
-        points = problem.points
-    if points is None or (bounds is None and not isinstance(points, TaskGraph)):
-        missing = "bounds" if points is not None else "points" if bounds is not None else "points and bounds"
-        raise ParameterError(missing, "nothing", f"they must be given for {robot.name}, which has no preset for this")
-    graph = points if isinstance(points, TaskGraph) else staggered_grid(bounds or (), points)
+    graph = points if isinstance(points, TaskGraph) else _grid(robot, task, points, bounds, problem)
     if seeds is None:
         seeds = "auto" if problem is None else problem.seeds
     if isinstance(seeds, str) and seeds != "auto":
@@ -169,3 +165,17 @@ def _complete(
     if graph.points.shape[1] != task.width:
         raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.width} for {task.name}")
     return Problem(task, graph, seeds)
+
+
+def _grid(
+    robot: Robot, task: TaskSpace | str | None, points: int | None, bounds: Bounds | None, problem: Preset | None
+) -> TaskGraph:
+    """The staggered grid of the preset, or over what the arm reaches, as far as it is not given."""
+    if bounds is None and problem is not None:
+        bounds = problem.bounds
+    if bounds is None:
+        axes = task.dimension if isinstance(task, TaskSpace) else 2 if stays_in_plane(robot) else 3
+        bounds = reach_box(robot, axes)
+    if points is None:
+        points = problem.points if problem is not None else _POINTS[len(check_bounds(bounds))]
+    return staggered_grid(bounds, points)

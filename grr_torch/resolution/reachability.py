@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -14,6 +16,11 @@ from grr_torch.spaces.task import TaskSpace
 
 # random starts that a point gets before those that were reached are set aside
 _ROUND = 4
+# of a box: random configurations; of those farthest out to each side, how many are varied, how often, and in how many
+# rounds: long arms are hardly ever stretched by chance
+_DRAWN, _FARTHEST, _VARIED, _VARIATIONS = 10_000, 8, 32, 40
+# metres below which a tool does not move
+_STILL = 1e-5
 
 
 def measure_reachability(
@@ -109,3 +116,57 @@ def reach(robot: Robot) -> tuple[Tensor, float]:
             radius += float((joint.multiplier * ends + joint.offset).abs().max())
     radius += float(tree.links[tree.tool][1][3, :3].norm())
     return tree.mounts[tree.path[0]][3, :3].cpu(), radius
+
+
+def stays_upright(robot: Robot) -> bool:
+    """Whether the tool's z axis stays along that of the base, over random configurations."""
+    rotation = _some_poses(robot)[1]
+    return bool(((rotation[:, 2, 2].abs() - 1.0).abs() < 1e-5).all())
+
+
+def stays_in_plane(robot: Robot) -> bool:
+    """Whether the tool stays upright and at one z, over random configurations."""
+    z = _some_poses(robot)[0][:, 2]
+    return stays_upright(robot) and bool((z - z[0]).abs().max() < _STILL)
+
+
+def _some_poses(robot: Robot) -> tuple[Tensor, Tensor]:
+    return robot.forward_kinematics(robot.sample(64, torch.Generator().manual_seed(0)))
+
+
+def reach_box(robot: Robot, axes: int) -> list[tuple[float, float]]:
+    """A box that holds what the arm reaches: (low, high) of each axis [m], rounded outwards.
+
+    From tool positions of random configurations, of which those farthest out are varied; the same each time.
+
+    Args:
+        robot: The robot.
+        axes: 2 or 3.
+
+    Raises:
+        ParameterError: A sliding joint has no limits, or the tool does not move along an axis.
+    """
+    wanted = "(low, high) of each axis (--bounds)"
+    if not math.isfinite(reach(robot)[1]):
+        raise ParameterError("bounds", "nothing", f"{wanted}, as a sliding joint of {robot.name} has no limits")
+    generator = torch.Generator().manual_seed(0)
+    q = robot.sample(_DRAWN, generator)
+    places = robot.forward_kinematics(q)[0][:, :axes]
+    for _ in range(_VARIATIONS):
+        farthest = torch.cat([side.topk(_FARTHEST, dim=0).indices for side in (places, -places)]).flatten()
+        parents = q[farthest].repeat(_VARIED, 1)
+        redrawn = torch.rand(parents.shape, generator=generator).to(q.device) < 1.0 / robot.n
+        children = torch.where(redrawn, robot.sample(len(parents), generator), parents)
+        q = torch.cat([q[farthest], children])
+        places = robot.forward_kinematics(q)[0][:, :axes]
+    low, high = places.amin(0).cpu().double(), places.amax(0).cpu().double()
+    for name, extent in zip("xyz", (high - low).tolist(), strict=False):
+        if extent < _STILL:
+            raise ParameterError(
+                "bounds", "nothing", f"{wanted}, as the tool of {robot.name} does not move along {name}"
+            )
+    digits = 1 - math.floor(math.log10(float((high - low).max())))
+    scale = 10.0**digits
+    # what is on the border but for rounding is not outside
+    low, high = (low * scale + 1e-3).floor() / scale, (high * scale - 1e-3).ceil() / scale
+    return [(round(a, digits), round(b, digits)) for a, b in zip(low.tolist(), high.tolist(), strict=True)]

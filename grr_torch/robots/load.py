@@ -155,7 +155,9 @@ def _preset(name_or_path: str | os.PathLike[str]) -> Preset | None:
 def _only_leaf(urdf: Urdf) -> str:
     leaves = urdf.leaves()
     if len(leaves) > 1:
-        raise ParameterError("tool", "nothing", f"one of the links, as the URDF has several ends: {', '.join(leaves)}")
+        raise ParameterError(
+            "tool", "nothing", f"one of the links (--tool), as the URDF has several ends: {', '.join(leaves)}"
+        )
     return leaves[0]
 
 
