@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import pytest
 import torch
 
 import grr_torch
-from grr_torch.errors import ParameterError
+from grr_torch.errors import GrrWarning, ParameterError
 from grr_torch.resolution.problem import pose_problem
 from grr_torch.resolution.reachability import reach, reach_box
 
@@ -92,3 +94,20 @@ def test_presets_keep_their_bounds(kinova):
     ends = [side.tolist() for side in problem.graph.points.aminmax(dim=0)]
     assert tuple(zip(*ends, strict=True)) == preset.bounds
     assert len(problem.graph.points) >= preset.points
+
+
+def test_bounds_that_leave_z_free_are_warned_of(kinova, flat_arm, tmp_path):
+    sides = [(-0.3, 0.3), (-0.3, 0.3)]
+    with pytest.warns(GrrWarning, match="leave z free, and kinova moves in space: six bounds") as warned:
+        grr_torch.build(kinova, grr_torch.Position(2), bounds=sides, points=20, refine=False)
+    assert len(warned) == 1
+    assert warned[0].filename == __file__
+    lift = chain(tmp_path / "lift.urdf", TURN, TURN, ("prismatic", "0 0 1", (0, 0.2)))
+    with pytest.warns(GrrWarning, match="leave z free"):
+        pose_problem(lift, grr_torch.Position(2), bounds=sides)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pose_problem(flat_arm, bounds=sides)
+        pose_problem(kinova, grr_torch.Position(3), bounds=[*sides, (0.2, 0.6)])
+        graph = grr_torch.staggered_grid(sides, 20)
+        pose_problem(kinova, grr_torch.Position(2), points=graph)

@@ -82,3 +82,16 @@ def test_an_arm_is_built_from_its_urdf_and_tool_alone(run_cli, two_ends):
     roadmap = Roadmap.load("two_ends.grr")
     assert len(roadmap.points) >= 3000
     assert bool(roadmap.resolved.any())
+
+
+def test_what_leaves_z_free_is_one_warning(run_cli, two_ends):
+    options = ("--points", 60, "--no-record", "--no-refine", "--json")
+    words = ("build", "--robot", two_ends, "--package-dir", "packages", "--tool", "flange", *options)
+    code, shown, complaint = run_cli(*words, "--bounds", -0.4, 0.4, -0.4, 0.4)
+    assert code == 0
+    assert json.loads(shown)["bounds"] == [[-0.4, 0.4], [-0.4, 0.4]]
+    assert complaint == (
+        "warning: bounds of x and y leave z free, and two_ends moves in space: six bounds give a map in space\n"
+    )
+    words = ("build", "--robot", "planar_5", *options)
+    assert run_cli(*words, "--bounds", -0.4, 0.4, -0.4, 0.4)[2] == ""

@@ -54,6 +54,9 @@ def pose_problem(
     problem = _complete(robot, task, points, bounds, seeds, rotations)
     check_task(robot, problem.task)
     own_graph = isinstance(points, TaskGraph)
+    if not own_graph and problem.task.dimension == 2 and not stays_in_plane(robot):
+        text = f"bounds of x and y leave z free, and {robot.name} moves in space: six bounds give a map in space"
+        warnings.warn(text, GrrWarning, stacklevel=3)
     _check_reach(robot, problem.task, problem.graph, warn=not own_graph)
     return problem
 
