@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import json
 import math
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any, ParamSpec, TextIO, TypeVar
 
 import typer
@@ -26,6 +27,9 @@ NOT_CHECKED = "not checked: no sphere model"
 
 # connected parts whose sizes are listed
 _PARTS = 5
+
+# seconds from one line about progress to the next, where there is no terminal
+_EVERY = 10.0
 
 # where builds run
 ENGINES = ("local", "ray")
@@ -75,7 +79,7 @@ def _show_warning(
 
 @contextmanager
 def progress_bar() -> Iterator[ProgressBar]:
-    """A bar for each stage on standard error, gone when the work is done; silent where there is no terminal."""
+    """A bar for each stage on standard error, gone when the work is done; lines where there is no terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -83,8 +87,33 @@ def progress_bar() -> Iterator[ProgressBar]:
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     left = TextColumn("{task.fields[left]}")
-    with Bar(*columns, left, console=console, transient=True, disable=not console.is_terminal) as bar:
-        yield ProgressBar(bar)
+    shown = console.is_terminal
+    with Bar(*columns, left, console=console, transient=True, disable=not shown) as bar:
+        progress = ProgressBar(bar)
+        with nullcontext() if shown else _lines(progress):
+            yield progress
+
+
+@contextmanager
+def _lines(progress: ProgressBar) -> Iterator[None]:
+    """Says on standard error how far the work is, every ten seconds in which it got farther."""
+    finished = threading.Event()
+
+    def tell() -> None:
+        said = ""
+        while not finished.wait(_EVERY):
+            if progress.line != said:
+                said = progress.line
+                typer.echo(said, err=True)
+
+    # reports come when they come: between two, minutes may pass
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        finished.set()
+        thread.join()
 
 
 class ProgressBar:
@@ -92,6 +121,9 @@ class ProgressBar:
 
     Where there is a plan of its stages, what is left of all of it is told; else, of the present stage alone, from how
     fast that has been. Stages may end early.
+
+    Attributes:
+        line: What was reported last, as a line.
     """
 
     def __init__(self, bar: Any) -> None:
@@ -99,6 +131,7 @@ class ProgressBar:
         self._tasks: dict[str, Any] = {}
         self._reported: dict[str, int] = {}
         self._outlook: Outlook | None = None
+        self.line = ""
 
     def foretell(self, plan: Plan) -> None:
         """Tells from here on what is left of a plan."""
@@ -113,7 +146,9 @@ class ProgressBar:
         self._reported[stage] = done
         for task in self._tasks.values():
             self._bar.update(task, left="")
-        self._bar.update(self._tasks[stage], completed=done, total=total, left=self._left(stage, done, total))
+        left = self._left(stage, done, total)
+        self._bar.update(self._tasks[stage], completed=done, total=total, left=left)
+        self.line = f"{stage} {done:,}/{total:,}" + (f", {left}" if left else "")
 
     def _left(self, stage: str, done: int, total: int) -> str:
         if self._outlook is not None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import time
+
 import pytest
+from grr_torch.cli import show
 
 from grr_torch import build, load_robot
 from grr_torch.progress import Outlook
@@ -88,3 +92,33 @@ def test_a_build_goes_through_all_stages_that_are_foretold_of_it(task, rotations
 
     build(robot, task, points=400, **turning, **options, progress=report).quality(report)
     assert [plan[at][0] for at in entered] == [stage for stage, _ in plan[:-1]], "all but writing, none skipped"
+
+
+def test_without_a_terminal_lines_at_times_say_how_far_the_work_is(monkeypatch, capfd):
+    monkeypatch.setattr(show, "_EVERY", 0.2)
+    begun = time.perf_counter()
+    with show.progress_bar() as progress:
+        for done in range(50):
+            progress("fitting spheres", done, 2000)
+            time.sleep(0.02)
+        progress("fitting spheres", 2000, 2000)
+        # nothing new to say
+        time.sleep(0.7)
+    seconds = time.perf_counter() - begun
+    printed, told = capfd.readouterr()
+    lines = told.splitlines()
+    assert printed == ""
+    assert 3 <= len(lines) <= seconds / 0.2
+    assert all(re.fullmatch(r"fitting spheres [\d,]+/2,000(, about \d+:\d\d:\d\d left)?", line) for line in lines)
+    assert lines[-1] == "fitting spheres 2,000/2,000"
+    assert len(set(lines)) == len(lines)
+
+
+def test_what_is_done_soon_says_nothing(monkeypatch, capfd):
+    monkeypatch.setattr(show, "_EVERY", 30.0)
+    begun = time.perf_counter()
+    with show.progress_bar() as progress:
+        progress("fitting spheres", 3, 8)
+        time.sleep(0.1)
+    assert time.perf_counter() - begun < 10.0
+    assert capfd.readouterr() == ("", "")
