@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -151,6 +154,20 @@ def test_unusable_seeds_are_named_and_the_build_goes_on(kinova, generator):
     with pytest.warns(GrrWarning, match=wanted):
         roadmap = grr_torch.build(kinova, "position", points=300, seeds=seeds)
     assert bool(roadmap.resolved.any())
+
+
+def test_only_seeds_that_were_given_are_warned_of(planar_5, monkeypatch):
+    beyond = torch.tensor([[0.3, 0.4, 0.4, 0.4, 0.4], [0.3, 9.0, 0.4, 0.4, 0.4]], dtype=torch.float64)
+    robot = replace(planar_5, upper=torch.full_like(planar_5.upper, 3.0))
+    with pytest.warns(GrrWarning, match="1 of 2 seeds are not used"):
+        given = grr_torch.build(robot, "position", points=50, seeds=beyond, refine=False)
+    # the package's `build` is the function
+    module = importlib.import_module("grr_torch.resolution.build")
+    monkeypatch.setattr(module, "find_seeds", lambda *_, **__: beyond)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = grr_torch.build(robot, "position", points=50, seeds="auto", refine=False)
+    assert torch.equal(found.wave, given.wave)
 
 
 @pytest.mark.parametrize(

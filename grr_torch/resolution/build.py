@@ -125,10 +125,10 @@ def build(
             if method == "random":
                 parts = _at_random(robot, problem, samples, seed, tolerances, progress, kept)
             else:
-                seeded = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
-                parts = _expanded(robot, seeded, neighbours, tolerances, check, progress, kept)
                 # where seeds are found, what from: they may be as many as the vertices
                 found = isinstance(problem.seeds, str)
+                seeded = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
+                parts = _expanded(robot, seeded, neighbours, tolerances, check, progress, kept, warn=not found)
                 parts.chosen.update({"seeds": "auto", "candidates": candidates} if found else {"seeds": _rows(problem)})
         settings = {
             "margin": robot.margin,
@@ -234,6 +234,8 @@ def _expanded(
     check: EdgeCheck,
     progress: Progress,
     kept: Checkpoint,
+    *,
+    warn: bool,
 ) -> _Parts:
     task, graph, table = problem
     assert not isinstance(table, str)
@@ -246,6 +248,7 @@ def _expanded(
         tolerances=tolerances,
         progress=progress,
         kept=kept.stage("expansion"),
+        warn=warn,
     )
     found = expansion.configurations, expansion.resolved
     stage = kept.stage("edges")

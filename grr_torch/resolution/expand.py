@@ -53,6 +53,7 @@ def expand(
     tolerances: Tolerances = DEFAULT_TOLERANCES,
     progress: Progress = silent,
     kept: Stage = UNKEPT,
+    warn: bool = True,
 ) -> Expansion:
     """Expands seeds over a task graph.
 
@@ -72,6 +73,7 @@ def expand(
         tolerances: Of the projections.
         progress: Told how many vertices are resolved.
         kept: Where it is kept how far that is.
+        warn: Whether seeds that cannot be used are named in a GrrWarning.
 
     Raises:
         SeedError: No seed can be used.
@@ -80,7 +82,7 @@ def expand(
     if neighbours is None:
         neighbours = default_neighbours(task)
     check_neighbours(task, neighbours)
-    vertices, placed = place_seeds(robot, task, graph, check_seeds(robot, seeds), tolerances)
+    vertices, placed = place_seeds(robot, task, graph, check_seeds(robot, seeds), tolerances, warn=warn)
     return grow(
         robot,
         task,

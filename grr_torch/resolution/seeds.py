@@ -75,12 +75,12 @@ def check_seeds(robot: Robot, seeds: SeedsLike) -> Tensor:
 
 
 def place_seeds(
-    robot: Robot, task: TaskSpace, graph: TaskGraph, seeds: Tensor, tolerances: Tolerances
+    robot: Robot, task: TaskSpace, graph: TaskGraph, seeds: Tensor, tolerances: Tolerances, *, warn: bool = True
 ) -> tuple[Tensor, Tensor]:
     """Projects each seed to the vertex nearest to its tool, or the next nearest of eight that it reaches.
 
     Of seeds that share a vertex, the one that had to move least is kept. Seeds that cannot be used are named in a
-    GrrWarning.
+    GrrWarning, if `warn`.
 
     Returns:
         Vertices (K,) and their configurations (K, n).
@@ -99,7 +99,7 @@ def place_seeds(
         "outside joint limits": ~robot.within_limits(seeds),
     }
     usable = valid.any(1) & ~torch.stack(list(wrong.values())).any(0)
-    _report(usable, wrong)
+    _report(usable, wrong, warn)
     first = valid.int().argmax(1)
     rows = torch.arange(len(seeds), device=seeds.device)
     configurations = solved.T.reshape(len(seeds), tried, robot.n)[rows, first]
@@ -112,8 +112,8 @@ def place_seeds(
     return vertices[kept], configurations[kept]
 
 
-def _report(usable: Tensor, wrong: dict[str, Tensor]) -> None:
-    """Warns of seeds that cannot be used, each with the first thing that is wrong with it.
+def _report(usable: Tensor, wrong: dict[str, Tensor], warn: bool) -> None:
+    """Warns, if asked to, of seeds that cannot be used, each with the first thing that is wrong with it.
 
     Raises:
         SeedError: None can.
@@ -127,7 +127,8 @@ def _report(usable: Tensor, wrong: dict[str, Tensor]) -> None:
     text = "; ".join(f"seed {index}: {reason}" for index, reason in reasons.items())
     if len(reasons) == len(usable):
         raise SeedError(f"none of {len(usable)} seeds can be used: {text}", reasons)
-    warnings.warn(f"{len(reasons)} of {len(usable)} seeds are not used: {text}", GrrWarning, stacklevel=4)
+    if warn:
+        warnings.warn(f"{len(reasons)} of {len(usable)} seeds are not used: {text}", GrrWarning, stacklevel=4)
 
 
 def _names(indices: Sequence[int]) -> str:
