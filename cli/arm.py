@@ -35,6 +35,9 @@ Axis = Annotated[
 Tool = Annotated[str | None, typer.Option(help="Link whose pose is controlled; needed if the URDF has several ends.")]
 Base = Annotated[str | None, typer.Option(help="Link in whose frame points are given.")]
 PackageDirs = Annotated[list[Path] | None, typer.Option(help="Folder for package:// meshes; repeatable.")]
+AllowMissingMeshes = Annotated[
+    bool, typer.Option("--allow-missing-meshes", help="Go on where meshes are missing: the arm is shown without them.")
+]
 Held = Annotated[list[str] | None, typer.Option(help="Hold a joint still; repeatable.", metavar="J=VALUE")]
 Spheres = Annotated[Path | None, typer.Option(help="Sphere file for self-collision (grr-torch spheres).")]
 Margin = Annotated[float | None, typer.Option(help="Added to every self-collision check, in metres.")]
@@ -46,6 +49,7 @@ def load_arm(
     tool: str | None,
     base: str | None,
     package_dir: Sequence[Path] | None,
+    allow_missing_meshes: bool,
     hold: Sequence[str] | None,
     spheres: Path | None,
     margin: float | None,
@@ -59,6 +63,7 @@ def load_arm(
         tool=tool,
         base=base,
         package_dirs=package_dir or (),
+        allow_missing_meshes=allow_missing_meshes,
         held_joints=named_numbers("--hold", hold or (), "JOINT=VALUE, the value in radians or metres"),
         spheres=spheres,
         margin=margin,

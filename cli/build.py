@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 from grr_torch.cli.arm import (
+    AllowMissingMeshes,
     Axis,
     Base,
     Held,
@@ -101,6 +102,7 @@ def build(
     rotation: Rotation = None,
     axis: Axis = None,
     package_dir: PackageDirs = None,
+    allow_missing_meshes: AllowMissingMeshes = False,
     hold: Held = None,
     spheres: Spheres = None,
     margin: Margin = None,
@@ -146,6 +148,7 @@ def build(
             tool=tool,
             base=base,
             package_dir=package_dir,
+            allow_missing_meshes=allow_missing_meshes,
             hold=hold,
             spheres=spheres,
             margin=margin,

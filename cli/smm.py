@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from grr_torch.cli.arm import (
+    AllowMissingMeshes,
     Axis,
     Base,
     Held,
@@ -64,6 +65,7 @@ def smm(
     tool: Tool = None,
     base: Base = None,
     package_dir: PackageDirs = None,
+    allow_missing_meshes: AllowMissingMeshes = False,
     hold: Held = None,
     spheres: Spheres = None,
     margin: Margin = None,
@@ -85,7 +87,14 @@ def smm(
         given = None
         if robot is not None:
             given = load_arm(
-                robot, tool=tool, base=base, package_dir=package_dir, hold=hold, spheres=spheres, margin=margin
+                robot,
+                tool=tool,
+                base=base,
+                package_dir=package_dir,
+                allow_missing_meshes=allow_missing_meshes,
+                hold=hold,
+                spheres=spheres,
+                margin=margin,
             )
         turning = read_turning(rotation, axis)
         graph = _roadmap(roadmap, given, task, turning, bool(point), progress)

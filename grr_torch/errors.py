@@ -80,7 +80,8 @@ class MeshNotFoundError(GrrError):
         places = ", ".join(str(path) for path in searched) or "nowhere: there is no folder to search"
         super().__init__(
             f"mesh '{filename}' of link '{link}' not found; looked at: {places}. "
-            "More folders to search for package:// names are given by --package-dir (package_dirs)."
+            "More folders to search for package:// names are given by --package-dir (package_dirs); "
+            "--allow-missing-meshes (allow_missing_meshes) does without."
         )
 
 

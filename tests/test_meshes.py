@@ -69,17 +69,20 @@ def test_a_package_is_looked_for_first_where_it_is_said_to_be(load, tmp_path):
     "mesh", ["package://arm/b.stl", "package://[arm/b.stl", "package://arm/b%00.stl", "b.stl", "b" * 300]
 )
 @pytest.mark.parametrize("tag", ["collision", "visual"])
-def test_kinematics_needs_no_mesh(load, mesh, tag):
+def test_a_mesh_may_be_missing_only_if_that_is_allowed(load, mesh, tag):
+    with pytest.raises(MeshNotFoundError, match="--allow-missing-meshes"):
+        load(meshed(mesh, tag))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        robot = load(meshed(mesh, tag))
+        robot = load(meshed(mesh, tag), allow_missing_meshes=True)
     assert robot.n == 1
     with pytest.raises(MeshNotFoundError):
         robot.urdf.mesh_path(mesh, "b")
 
 
 def test_a_missing_mesh_is_named_with_where_it_was_sought(load, tmp_path):
-    robot = load(meshed("package://arm/b.stl"), package_dirs=[tmp_path / "packages"])
+    options = {"package_dirs": [tmp_path / "packages"], "allow_missing_meshes": True}
+    robot = load(meshed("package://arm/b.stl"), **options)
     with pytest.raises(MeshNotFoundError) as caught:
         fit_spheres(robot.urdf)
     assert caught.value.filename == "package://arm/b.stl"

@@ -26,6 +26,7 @@ def load_robot(
     tool: str | None = None,
     base: str | None = None,
     package_dirs: Sequence[str | os.PathLike[str]] = (),
+    allow_missing_meshes: bool = False,
     held_joints: Mapping[str, float] | None = None,
     spheres: str | os.PathLike[str] | SphereModel | None = None,
     margin: float | None = None,
@@ -38,8 +39,9 @@ def load_robot(
         name_or_path: A bundled name (`grr-torch robots` lists them) or the path of a URDF.
         tool: Link whose pose is controlled; by default the preset's, or the URDF's last link if it has one only.
         base: Link in whose frame poses are given; by default the preset's, or the URDF's root.
-        package_dirs: Folders in which `package://` mesh names are searched before those above the URDF. A mesh that is
-            missing is left out where the robot is shown.
+        package_dirs: Folders in which `package://` mesh names are searched before those above the URDF.
+        allow_missing_meshes: Whether to go on where meshes are missing: kinematics needs none, and the robot is shown
+            without them.
         held_joints: Values [rad or m] of joints that do not move. Joints outside the chain stay at 0 by default.
         spheres: Sphere file or model; by default the preset's. A URDF without one is not checked for self-collision.
         margin: Distance [m] below which two links count as in collision; by default the preset's, or 0.
@@ -48,6 +50,7 @@ def load_robot(
 
     Raises:
         UnknownNameError: No such robot, link or joint; the known ones are listed.
+        MeshNotFoundError: A mesh is missing that may not be.
         UrdfError: The URDF is malformed, or between base and tool has no movable joint or one of a type not supported.
         FileFormatError: The sphere file is not one.
         ParameterError: No tool is given for a URDF with several ends, or a held value, the margin, the device or the
@@ -78,6 +81,8 @@ def load_robot(
         device=find_device(device),
         dtype=dtype,
     )
+    if not allow_missing_meshes:
+        urdf.check_meshes()
     return replace(robot, preset=preset)
 
 

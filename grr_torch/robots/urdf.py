@@ -154,6 +154,18 @@ class Urdf:
                 return candidate
         raise MeshNotFoundError(filename, link, candidates)
 
+    def check_meshes(self) -> None:
+        """Looks every mesh up.
+
+        Raises:
+            MeshNotFoundError: For the first one that is missing.
+        """
+        for shapes in (self.collisions, self.visuals):
+            for link, of_link in shapes.items():
+                for shape in of_link:
+                    if shape.filename is not None:
+                        self.mesh_path(shape.filename, link)
+
     def _mesh_candidates(self, filename: str) -> list[Path]:
         url = urlparse(filename)
         if url.scheme == "package":
