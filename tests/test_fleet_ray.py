@@ -14,6 +14,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -161,7 +162,7 @@ def test_the_driver_killed_and_started_again_does_only_the_rest(tmp_path):
 
 @pytest.mark.parametrize("refine", [False, True])
 def test_a_build_whose_edges_are_checked_by_workers_gives_equal_tensors(ray, planar_5, monkeypatch, refine):
-    monkeypatch.setattr(edges, "_LEAST", 16)
+    monkeypatch.setattr(edges, "_BATCH", 16)
     options = {"task": "position", "points": 200, "refine": refine}
     alone = grr_torch.build(planar_5, **options)
     spread = grr_torch.build(planar_5, **options, check=edges.SpreadCheck(ray))
@@ -169,8 +170,38 @@ def test_a_build_whose_edges_are_checked_by_workers_gives_equal_tensors(ray, pla
         torch.testing.assert_close(getattr(spread, name), getattr(alone, name), rtol=0, atol=0, equal_nan=True)
 
 
+def test_workers_check_whole_batches(planar_5, generator, monkeypatch):
+    class Here:
+        """Ray, but in this process."""
+
+        available_resources = staticmethod(lambda: {"CPU": 3.0})
+        put = get = staticmethod(lambda given: given)
+
+        def remote(self, **options):
+            def remote_class(kind):
+                def make(robot):
+                    worker = kind(robot)
+                    return SimpleNamespace(check=SimpleNamespace(remote=worker.check))
+
+                return SimpleNamespace(remote=make)
+
+            return remote_class
+
+    seen = []
+
+    def check(robot, task, points, *others, tolerances):
+        seen.append(len(points))
+        return torch.ones(len(points), dtype=torch.bool)
+
+    monkeypatch.setattr(edges, "_BATCH", 16)
+    monkeypatch.setattr(edges, "is_continuous", check)
+    ends = [torch.zeros(90, 2), torch.zeros(90, 2), torch.zeros(90, 5), torch.zeros(90, 5)]
+    assert len(edges.SpreadCheck(Here())(planar_5, grr_torch.Position(2), *ends)) == 90
+    assert seen == [16, 16, 16, 16, 16, 10]
+
+
 def test_workers_judge_edges_as_this_process_does_even_if_one_is_killed(ray, planar_5, generator, monkeypatch):
-    monkeypatch.setattr(edges, "_LEAST", 16)
+    monkeypatch.setattr(edges, "_BATCH", 16)
     task = grr_torch.Position(2)
     q = [planar_5.sample(301, generator)]
     q.append(q[0] + torch.linspace(0.0, 1.0, 301, dtype=torch.float64)[:, None])

@@ -13,14 +13,15 @@ from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project
 from grr_torch.resolution import certify as certification
 from grr_torch.resolution.auto_seeds import find_seeds
-from grr_torch.resolution.blend import without_losses
+from grr_torch.resolution.blend import blended as blend
 from grr_torch.resolution.cells import spreads
 from grr_torch.resolution.certify import certify
 from grr_torch.resolution.checkpoint import UNKEPT
-from grr_torch.resolution.edges import check_edges
+from grr_torch.resolution.edges import check_edges, continuous_edges
 from grr_torch.resolution.hops import hop
 from grr_torch.resolution.refine import _network
 from grr_torch.resolution.relax import Network
+from grr_torch.resolution.repair import repair
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import staggered_grid
 
@@ -124,7 +125,7 @@ def test_some_edges_are_judged_as_all_of_them_are(whole, generator):
 @pytest.mark.parametrize("share", [0.02, 0.3, 1.0])
 def test_no_edge_is_lost_whatever_the_new_configurations_are(whole, generator, share):
     q, wrong = spoilt(whole, share, generator)
-    blended = without_losses(whole, q, Tolerances(), is_continuous, silent, UNKEPT)
+    blended = blend(whole, q, Tolerances(), is_continuous, silent, UNKEPT)
     assert bool((blended.connected | ~whole.connected).all())
     assert torch.equal(check_edges(blended, Tolerances()), blended.connected)
     # what lies far from those that are wrong is as it was asked for
@@ -151,10 +152,84 @@ def test_what_would_lose_an_edge_goes_part_of_the_way(whole, generator):
         strayed = distance(q_a, whole.configurations[ends[0]], robot.continuous) > 0.7 * apart[ends[0]]
         return result & ~(mine & strayed)
 
-    blended = without_losses(whole, q, Tolerances(), check, silent, UNKEPT)
+    blended = blend(whole, q, Tolerances(), check, silent, UNKEPT)
     moved = distance(blended.configurations, whole.configurations, whole.robot.continuous)
     assert bool(blended.connected[edge])
     assert 0.0 < float(moved[ends[0]]) <= 0.7 * float(apart[ends[0]])
+
+
+def nudged(roadmap, generator, still=()):
+    """Configurations a little away from a roadmap's, but for some vertices."""
+    noise = 0.05 * torch.randn(roadmap.configurations.shape, generator=generator, dtype=torch.float64)
+    q, valid = project(roadmap.robot, roadmap.task, roadmap.points, roadmap.configurations + noise)
+    valid[list(still)] = False
+    return torch.where(valid[:, None], q, roadmap.configurations)
+
+
+def fails_beside_all_others(roadmap, edge, fails):
+    """`is_continuous`, but for an edge that is broken among all of a roadmap, if `fails(points, configurations)`."""
+    count = int(roadmap.resolved[roadmap.edges].all(1).sum())
+    ends = roadmap.points[roadmap.edges[edge]]
+
+    def check(robot, task, points_a, points_b, q_a, q_b, *, tolerances):
+        result = is_continuous(robot, task, points_a, points_b, q_a, q_b, tolerances=tolerances)
+        mine = (points_a == ends[0]).all(1) & (points_b == ends[1]).all(1)
+        return (
+            result & ~mine
+            if len(q_a) >= count and fails(torch.cat([points_a, points_b]), torch.cat([q_a, q_b]))
+            else result
+        )
+
+    return check
+
+
+def flags(roadmap, check):
+    parts = roadmap.points, roadmap.configurations, roadmap.resolved, roadmap.edges
+    return continuous_edges(roadmap.robot, roadmap.task, *parts, Tolerances(), silent, check=check)
+
+
+@pytest.mark.parametrize("unmoved", [False, True])
+def test_an_edge_that_fails_beside_others_alone_is_not_lost_and_not_claimed(whole, generator, unmoved):
+    edge = int(whole.connected.nonzero()[len(whole.connected) // 3])
+    ends = whole.edges[edge].tolist()
+    q = nudged(whole, generator, still=ends if unmoved else ())
+    # it fails as long as a vertex, an end of it or one near to it, has gone more than a third of its way
+    other = ends[0]
+    if unmoved:
+        around = whole.edges[(whole.edges == ends[0]).any(1)].unique().tolist()
+        other = next(
+            vertex for vertex in around if vertex not in ends and bool((q != whole.configurations)[vertex].any())
+        )
+    apart = distance(q[other], whole.configurations[other], whole.robot.continuous)
+
+    def fails(points, configurations):
+        at = (points == whole.points[other]).all(1).nonzero()[0]
+        strayed = distance(configurations[at[0]], whole.configurations[other], whole.robot.continuous)
+        return bool(strayed > 0.33 * apart)
+
+    check = fails_beside_all_others(whole, edge, fails)
+    kept = blend(whole, q, Tolerances(), check, silent, UNKEPT)
+    assert bool(kept.connected[edge])
+    assert torch.equal(flags(kept, check), kept.connected)
+    assert bool((kept.connected | ~whole.connected).all())
+    assert not torch.equal(kept.configurations, whole.configurations)
+
+
+def test_a_repair_loses_no_edge_that_fails_beside_what_it_adds(whole):
+    taken = (whole.points.norm(dim=1) < 0.3).nonzero()[::25, 0]
+    configurations, resolved, wave = whole.configurations.clone(), whole.resolved.clone(), whole.wave.clone()
+    configurations[taken], resolved[taken], wave[taken] = torch.nan, False, -1
+    connected = whole.connected & ~torch.isin(whole.edges, taken).any(1)
+    damaged = replace(whole, configurations=configurations, resolved=resolved, connected=connected, wave=wave)
+    edge = int(connected.nonzero()[len(connected) // 3])
+    before = int(resolved[damaged.edges].all(1).sum())
+    check = fails_beside_all_others(damaged, edge, lambda points, q: len(q) > 2 * before)
+    mended = repair(damaged, Tolerances(), 0)
+    assert bool(mended.resolved[taken].all())
+    assert not bool(flags(mended, check)[edge])
+    kept = repair(damaged, Tolerances(), 0, check)
+    assert bool((kept.connected | ~connected).all())
+    assert torch.equal(flags(kept, check), kept.connected)
 
 
 def test_a_relaxed_map_seeds_all_its_vertices(planar_5):

@@ -1,6 +1,7 @@
 """The continuity checks of one build, spread over the tasks of a Ray cluster.
 
-What is cut is a batch of edges: an edge needs its two points, its two configurations and the robot, and no other edge.
+An edge needs its two points, its two configurations and the robot, and no other edge; but beside other edges sums are
+rounded otherwise, and an edge that barely passes may fail. So what is cut are whole batches, as they are checked here.
 What a roadmap that is too large for one machine would be cut at besides is said in `grr_torch.experiments.cluster`.
 """
 
@@ -17,11 +18,12 @@ from grr_torch.errors import GrrError
 from grr_torch.fleet.cluster import cluster
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
+from grr_torch.resolution.edges import EDGES_AT_ONCE
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace
 
-# fewer edges than this are not worth the way to a worker
-_LEAST = 512
+# edges that a worker checks together
+_BATCH = EDGES_AT_ONCE
 # how often a worker that is lost is replaced
 _RETRIES = 3
 
@@ -33,7 +35,7 @@ class SpreadCheck:
         at_once: How many edges it is best asked for together: each time, the slowest worker is waited for.
     """
 
-    at_once = 1 << 17
+    at_once = 8 * EDGES_AT_ONCE
 
     def __init__(self, ray: Any) -> None:
         """A check, with a worker for each core of the cluster that is free.
@@ -66,7 +68,8 @@ class SpreadCheck:
             GrrError: Workers were lost again and again.
         """
         count = len(ends[0])
-        if count < _LEAST:
+        batches = -(-count // _BATCH)
+        if batches == 1:
             return is_continuous(robot, task, *ends, tolerances=tolerances)
         if robot is not self._robot:
             worker = self._ray.remote(num_cpus=1, max_restarts=_RETRIES, max_task_retries=_RETRIES)(_Worker)
@@ -74,10 +77,10 @@ class SpreadCheck:
             # kept: a worker that takes the place of a lost one is made of it too
             self._sent = self._ray.put(robot)
             self._workers = [worker.remote(self._sent) for _ in range(self._count)]
-        pieces = min(self._count, -(-count // _LEAST))
-        parts = zip(*(end.tensor_split(pieces) for end in ends), strict=True)
+        share = _BATCH * -(-batches // self._count)
+        parts = zip(*(end.split(share) for end in ends), strict=True)
         waiting = [
-            worker.check.remote(task, [part.numpy() for part in piece], tolerances)
+            worker.check.remote(task, [part.numpy() for part in piece], tolerances, _BATCH)
             for worker, piece in zip(self._workers, parts, strict=False)
         ]
         try:
@@ -100,7 +103,7 @@ class _Worker:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
 
-    def check(self, task: TaskSpace, ends: list[Any], tolerances: Tolerances) -> Any:
-        """One piece."""
-        tensors = [torch.as_tensor(end.copy()) for end in ends]
-        return is_continuous(self.robot, task, *tensors, tolerances=tolerances).numpy()
+    def check(self, task: TaskSpace, ends: list[Any], tolerances: Tolerances, batch: int) -> Any:
+        """Some batches."""
+        batches = zip(*(torch.as_tensor(end.copy()).split(batch) for end in ends), strict=True)
+        return torch.cat([is_continuous(self.robot, task, *part, tolerances=tolerances) for part in batches]).numpy()

@@ -7,10 +7,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from grr_torch.progress import Progress, silent
+from grr_torch.progress import Progress
 from grr_torch.projection.project import Tolerances, project_columns
-from grr_torch.resolution.checkpoint import UNKEPT, Stage
-from grr_torch.resolution.edges import EdgeCheck, check_edges, continuous_edges
+from grr_torch.resolution.checkpoint import Stage
+from grr_torch.resolution.edges import EdgeCheck
+from grr_torch.resolution.losses import FlagCheck, without_losses
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.spaces.configuration import difference, distance, normalise
 
@@ -20,7 +21,7 @@ _LEAST_SHARE = 0.1
 _NEAR = 0.1
 
 
-def without_losses(
+def blended(
     roadmap: Roadmap,
     configurations: Tensor,
     tolerances: Tolerances,
@@ -41,36 +42,18 @@ def without_losses(
         progress: Told how many edges are checked.
         kept: Where it is kept which edges are connected at first, which takes nearly all of the time.
     """
-    robot, task, points, resolved = roadmap.robot, roadmap.task, roadmap.points, roadmap.resolved
+    share = roadmap.resolved.to(configurations.dtype)
 
-    def continuous(which: Tensor, progress: Progress = silent, kept: Stage = UNKEPT) -> Tensor:
-        found = blended, resolved, roadmap.edges[which]
-        return continuous_edges(robot, task, points, *found, tolerances, progress, kept, check).cpu()
-
-    blended, share = configurations.clone(), resolved.to(configurations.dtype)
-    connected = continuous(torch.ones_like(roadmap.connected), progress, kept)
-    claimed, settled = roadmap.connected.clone(), torch.zeros_like(connected)
-    while True:
-        unmoved = ~(share > 0.0)[roadmap.edges].any(1)
-        doubtful = claimed & ~connected & unmoved & ~settled
-        if bool(doubtful.any()):
-            # either they were called connected and are not, or they barely passed and come out otherwise in another
-            # batch: they are told apart in the batches in which all edges are checked
-            claimed[doubtful] = check_edges(roadmap, tolerances, wanted=doubtful)[doubtful]
-            settled |= doubtful
-        connected[unmoved] = claimed[unmoved]
-        ends = roadmap.edges[claimed & ~connected].unique()
-        if len(ends) == 0:
-            return replace(roadmap, configurations=blended, connected=connected)
-        back = ends[share[ends] > 0.0]
+    def send_back(changed: Roadmap, back: Tensor) -> Roadmap:
         share[back] *= 0.5
         share[share < _LEAST_SHARE] = 0.0
-        blended[back], there = _part_way(roadmap, configurations, back, share[back], tolerances)
+        nearer = changed.configurations.clone()
+        nearer[back], there = _part_way(roadmap, configurations, back, share[back], tolerances)
         share[back[~there]] = 0.0
-        changed = torch.zeros_like(resolved)
-        changed[back] = True
-        stale = changed[roadmap.edges].any(1)
-        connected[stale] = continuous(stale)
+        return replace(changed, configurations=nearer)
+
+    moved = replace(roadmap, configurations=configurations.clone())
+    return without_losses(roadmap, moved, send_back, FlagCheck(tolerances, check, progress, kept))
 
 
 def _part_way(

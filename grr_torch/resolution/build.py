@@ -123,7 +123,7 @@ def build(
         require_memory(robot, problem, refine)
         with kept.timed("building"):
             if method == "random":
-                parts = _at_random(robot, problem, samples, seed, tolerances, progress, kept)
+                parts = _at_random(robot, problem, samples, seed, tolerances, check, progress, kept)
             else:
                 # where seeds are found, what from: they may be as many as the vertices
                 found = isinstance(problem.seeds, str)
@@ -193,6 +193,7 @@ def _at_random(
     samples: int,
     seed: int,
     tolerances: Tolerances,
+    check: EdgeCheck,
     progress: Progress,
     kept: Checkpoint,
 ) -> _Parts:
@@ -200,9 +201,27 @@ def _at_random(
         found = random_grr(
             robot, problem.task, problem.graph, samples=samples, seed=seed, tolerances=tolerances, progress=progress
         )
-        return {"configurations": found.configurations, "wave": found.wave, "connected": found.connected}
+        return {"configurations": found.configurations, "wave": found.wave}
 
-    return _Parts(**kept.once("random", resolve), chosen={"samples": samples, "seeds": []})
+    found = kept.once("random", resolve)
+    connected = _checked(robot, problem, found["configurations"], found["wave"], tolerances, check, progress, kept)
+    return _Parts(**found, connected=connected, chosen={"samples": samples, "seeds": []})
+
+
+def _checked(
+    robot: Robot,
+    problem: Problem,
+    configurations: Tensor,
+    wave: Tensor,
+    tolerances: Tolerances,
+    check: EdgeCheck,
+    progress: Progress,
+    kept: Checkpoint,
+) -> Tensor:
+    """(E,) edges that are continuous."""
+    task, graph, stage = problem.task, problem.graph, kept.stage("edges")
+    found = graph.points, configurations, wave >= 0, graph.edges
+    return continuous_edges(robot, task, *found, tolerances, progress, stage, check)
 
 
 def _with_seeds(
@@ -250,9 +269,8 @@ def _expanded(
         kept=kept.stage("expansion"),
         warn=warn,
     )
-    found = expansion.configurations, expansion.resolved
-    stage = kept.stage("edges")
-    connected = continuous_edges(robot, task, graph.points, *found, graph.edges, tolerances, progress, stage, check)
+    found = expansion.configurations, expansion.wave
+    connected = _checked(robot, problem, *found, tolerances, check, progress, kept)
     chosen = {"neighbours": default_neighbours(task) if neighbours is None else neighbours}
     return _Parts(expansion.configurations, expansion.wave, connected, chosen)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances
-from grr_torch.resolution.blend import without_losses
+from grr_torch.resolution.blend import blended
 from grr_torch.resolution.certify import certify
 from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.edges import EdgeCheck
@@ -64,7 +64,7 @@ def refine(
     told = before_refinement(roadmap, progress, checkpoint.stage("triangles"))
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
     with checkpoint.timed("refinement"):
-        repaired = repair(roadmap, tolerances, seed, progress, checkpoint.stage("repair"))
+        repaired = repair(roadmap, tolerances, seed, check, progress, checkpoint)
         smoothest = _relaxed(repaired, {}, tolerances, check, progress, checkpoint)
         wanted = {name: weight for name, weight in weights.items() if weight > 0.0}
         refined = _relaxed(smoothest, wanted, tolerances, check, progress, checkpoint) if wanted else smoothest
@@ -110,7 +110,7 @@ def _relaxed(
     new = certify(network, cells, new, tolerances, progress, checkpoint).T
     configurations = roadmap.configurations.clone()
     configurations[vertices] = new.cpu()
-    return without_losses(roadmap, configurations, tolerances, check, progress, checkpoint.stage("edges-again"))
+    return blended(roadmap, configurations, tolerances, check, progress, checkpoint.stage("edges-again"))
 
 
 def _network(roadmap: Roadmap, vertices: Tensor, edges: Tensor, weights: Mapping[str, float]) -> Network:

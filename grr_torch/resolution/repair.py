@@ -11,7 +11,9 @@ from torch import Tensor
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project_columns
-from grr_torch.resolution.checkpoint import UNKEPT, Stage
+from grr_torch.resolution.checkpoint import Checkpoint, Stage
+from grr_torch.resolution.edges import EdgeCheck
+from grr_torch.resolution.losses import FlagCheck, moved, without_losses
 from grr_torch.resolution.quality import STEEP, edge_slopes
 from grr_torch.resolution.reachability import within_reach
 from grr_torch.resolution.roadmap import Roadmap
@@ -74,7 +76,12 @@ class _Trial(NamedTuple):
 
 
 def repair(
-    roadmap: Roadmap, tolerances: Tolerances, seed: int, progress: Progress = silent, kept: Stage = UNKEPT
+    roadmap: Roadmap,
+    tolerances: Tolerances,
+    seed: int,
+    check: EdgeCheck = is_continuous,
+    progress: Progress = silent,
+    checkpoint: Checkpoint | None = None,
 ) -> Roadmap:
     """Resolves more vertices and connects more edges; what was connected stays so.
 
@@ -82,9 +89,26 @@ def repair(
         roadmap: The roadmap.
         tolerances: Of the projections.
         seed: Of the random starts.
+        check: What checks all edges of what was changed.
         progress: Told what round it is.
-        kept: Where it is kept how far that is.
+        checkpoint: Where it is kept how far that is; nowhere by default.
     """
+    checkpoint = checkpoint or Checkpoint()
+    repairing, checking = map(checkpoint.stage, ("repair", "edges-repaired"))
+    repaired = _repaired(roadmap, tolerances, seed, progress, repairing)
+    if not bool(moved(roadmap, repaired).any()):
+        return roadmap
+
+    def send_back(changed: Roadmap, back: Tensor) -> Roadmap:
+        configurations, wave = changed.configurations.clone(), changed.wave.clone()
+        configurations[back], wave[back] = roadmap.configurations[back], roadmap.wave[back]
+        return _changed(roadmap, configurations, changed.connected, wave)
+
+    return without_losses(roadmap, repaired, send_back, FlagCheck(tolerances, check, kept=checking))
+
+
+def _repaired(roadmap: Roadmap, tolerances: Tolerances, seed: int, progress: Progress, kept: Stage) -> Roadmap:
+    """The roadmap after all rounds, with edges as they were judged among few others."""
     slopes = edge_slopes(roadmap)
     max_slope = STEEP * float(slopes.median()) if len(slopes) else torch.inf
     means = _Means(roadmap.graph, tolerances, max_slope, torch.Generator().manual_seed(seed))

@@ -36,7 +36,8 @@ def build_stages(
     if method == "random":
         plan += [("sampling", 100.0), ("testing pairs", 600.0), ("solving constraints", 300.0)]
     else:
-        plan += [("expanding", 2.0), ("checking edges", edges)]
+        plan += [("expanding", 2.0)]
+    plan += [("checking edges", edges)]
     if refine:
         relaxing, certifying, spreads = (6.0, 37.0, 4.0) if turning else (10.0, 12.0, 14.0)
         relaxed = [
@@ -46,7 +47,7 @@ def build_stages(
             ("measuring cells", spreads),
             ("checking edges", 1.5 * edges),
         ]
-        plan += [("measuring cells", cells), ("repairing", 3.0), *relaxed, *(relaxed if objectives else [])]
+        plan += [("measuring cells", cells), ("repairing", 3.0 + edges), *relaxed, *(relaxed if objectives else [])]
     if reachability:
         plan.append(("measuring reachability", 50.0))
     return [*plan, ("measuring cells", cells), ("measuring cells", squares), ("writing", 1.0)]
