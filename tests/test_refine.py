@@ -21,6 +21,7 @@ from grr_torch.resolution.expand import expand
 from grr_torch.resolution.random_grr import random_grr
 from grr_torch.resolution.refine import refine
 from grr_torch.resolution.report import summary
+from grr_torch.resolution.seeds import in_the_middle
 from grr_torch.spaces.graph import Copies, staggered_grid
 
 PROBLEMS = [("planar_5", "position", 400), ("planar_5", "fixed-rotation", 400), ("kinova", "fixed-rotation", 1500)]
@@ -138,6 +139,58 @@ def test_seeds_are_found_for_arms_nobody_tuned_anything_for(tmp_path, figures, b
     quality = grr_torch.build(arm, task, points=400, bounds=bounds, reachability=10).quality()
     assert quality.coverage > 0.95
     assert quality.connectivity > 0.85
+
+
+@pytest.fixture
+def turning_arm(tmp_path):
+    """An arm whose joints can turn twice, from −2π or −π on."""
+    joints = [(*joint[:2], -(2 - k % 2) * math.pi, (2 + k % 2) * math.pi) for k, joint in enumerate(PANDA[0])]
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm_urdf(joints, PANDA[1]))
+    return grr_torch.load_robot(path)
+
+
+def test_found_seeds_lie_near_the_middle_of_limits_that_allow_several_turns(turning_arm):
+    task, graph = grr_torch.Position(3), staggered_grid([(0.3, 0.6), (-0.3, 0.3), (0.2, 0.6)], 60)
+    for seed in range(3):
+        seeds = find_seeds(turning_arm, task, graph, candidates=6, seed=seed, tolerances=Tolerances())
+        middle = 0.5 * (turning_arm.lower + turning_arm.upper)
+        away = 0.5 * (seeds.amin(0) + seeds.amax(0)) - middle
+        for turns in (-1, 1):
+            moved = seeds + 2.0 * math.pi * turns
+            allowed = ((moved >= turning_arm.lower) & (moved <= turning_arm.upper)).all(0)
+            nearer = (away + 2.0 * math.pi * turns).abs() < away.abs() - 1e-9
+            assert not bool((allowed & nearer).any())
+
+
+def test_seeds_turn_together_and_only_by_what_changes_nothing(turning_arm, kinova, planar_5, generator):
+    seeds = turning_arm.sample(50, generator) * torch.tensor([0.1, 0.9, 0.1, 0.1, 0.9, 0.1, 0.9], dtype=torch.float64)
+    seeds[:, 0] -= 4.5
+    moved = in_the_middle(turning_arm, seeds)
+    turns = (moved - seeds) / (2.0 * math.pi)
+    torch.testing.assert_close(turns, turns.round()[:1].expand_as(turns), atol=1e-9, rtol=0)
+    assert float(turns[0, 0]) == pytest.approx(1.0)
+    assert bool(turning_arm.within_limits(moved).all())
+    for one, other in zip(turning_arm.forward_kinematics(moved), turning_arm.forward_kinematics(seeds), strict=True):
+        torch.testing.assert_close(one, other)
+    for robot in (kinova, planar_5):
+        q = robot.sample(20, generator)
+        assert in_the_middle(robot, q).numpy().tobytes() == q.numpy().tobytes()
+
+
+def test_a_joint_that_another_follows_by_a_part_of_a_turn_is_not_turned(tmp_path, generator):
+    joints = [(*joint[:2], -2.0 * math.pi, 2.0 * math.pi) for joint in PANDA[0]]
+    follower = (
+        '<link name="side"/><joint name="follower" type="revolute"><parent link="tool"/><child link="side"/>'
+        '<axis xyz="0 0 1"/><limit lower="-9" upper="9" velocity="1" effort="1"/>'
+        '<mimic joint="joint1" multiplier="0.5"/></joint></robot>'
+    )
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm_urdf(joints, PANDA[1]).replace("</robot>", follower))
+    arm = grr_torch.load_robot(path, tool="tool")
+    seeds = 0.1 * arm.sample(10, generator) - 4.5
+    turned = (in_the_middle(arm, seeds) != seeds).all(0)
+    assert turned.tolist() == [False] + [True] * 6
 
 
 def test_where_nothing_is_reached_no_seeds_are_found(kinova):

@@ -23,6 +23,7 @@ from grr_torch.resolution.closed_paths import closed_paths
 from grr_torch.resolution.edges import EDGES_AT_ONCE
 from grr_torch.resolution.expand import default_neighbours, grow
 from grr_torch.resolution.relax import Network, relax
+from grr_torch.resolution.seeds import in_the_middle
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import Copies, TaskGraph, staggered_grid
@@ -103,7 +104,7 @@ def find_seeds(
     best = _costs(robot, task, coarse, maps).argsort(stable=True)[: math.ceil(_RELAXED * len(paths))]
     relaxed = _relaxed(robot, task, coarse, maps[best.to(maps.device)], tolerances, _ROUNDS)
     order = _costs(robot, task, coarse, relaxed).argsort(stable=True)[: math.ceil(_FINALISTS * len(paths))].tolist()
-    finalists = [relaxed[rank][~relaxed[rank].isnan().any(1)] for rank in order]
+    finalists = [in_the_middle(robot, relaxed[rank][~relaxed[rank].isnan().any(1)]) for rank in order]
     progress("choosing seeds", 2, 3)
     if len(graph.points) > _MOST_TRIED:
         return finalists[0]
@@ -119,7 +120,7 @@ def find_seeds(
     best = maps[int(_sums(slopes).argmin())]
     found = best[~best.isnan().any(1)]
     # on a graph with few vertices within reach none may have been placed
-    return found if len(found) else finalists[0]
+    return in_the_middle(robot, found) if len(found) else finalists[0]
 
 
 def _coarse(task: TaskSpace, graph: TaskGraph, points: int) -> TaskGraph:

@@ -15,6 +15,7 @@ from torch import Tensor
 from grr_torch.errors import SeedError
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.reachability import from_random_starts, within_reach
+from grr_torch.resolution.seeds import in_the_middle
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance, wrap
 from grr_torch.spaces.graph import TaskGraph
@@ -43,14 +44,16 @@ def closed_paths(
         tolerances: Of the projections.
 
     Returns:
-        About so many tables of configurations (S, n), and the share of the graph that is reachable, by a sample of it.
+        About so many tables of configurations (S, n), near the middle of the limits, and the share of the graph that is
+        reachable, by a sample of it.
 
     Raises:
         SeedError: No point was reached from random starts.
     """
     anchors = -(-count // (2 * _MEDOIDS))
     points, medoids, share = _medoids(robot, task, graph, anchors, generator, tolerances)
-    return _led_round(robot, task, points, medoids, tolerances), share
+    paths = _led_round(robot, task, points, medoids, tolerances)
+    return [in_the_middle(robot, path) for path in paths], share
 
 
 def _medoids(

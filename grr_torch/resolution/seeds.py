@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -72,6 +73,30 @@ def check_seeds(robot: Robot, seeds: SeedsLike) -> Tensor:
     if bad:
         raise SeedError(f"seeds {_names(bad)} hold NaN or infinite values", dict.fromkeys(bad, "not finite"))
     return table.to(robot.device)
+
+
+def in_the_middle(robot: Robot, seeds: Tensor) -> Tensor:
+    """The same poses of the arm with joints that can turn more than once near the middle of their limits.
+
+    Every such joint turns by whole turns, the same number for all seeds (S, n), so that what is near stays near, as far
+    as all of them stay within limits. Continuous joints stay as they are.
+    """
+    turn = 2.0 * math.pi
+    rates: dict[int, list[float]] = {}
+    for joint in robot.tree.joints:
+        rates.setdefault(joint.dof, []).append(joint.multiplier if joint.revolute else math.nan)
+    moved = seeds.clone()
+    for dof, (lower, upper) in enumerate(zip(robot.lower.tolist(), robot.upper.tolist(), strict=True)):
+        # a joint that follows must come round too
+        whole = all(rate.is_integer() for rate in rates[dof])
+        if len(seeds) == 0 or not whole or bool(robot.continuous[dof]) or not turn < upper - lower < math.inf:
+            continue
+        first, last = float(seeds[:, dof].amin()), float(seeds[:, dof].amax())
+        wanted = round((lower + upper - first - last) / (2.0 * turn))
+        fewest, most = math.ceil((lower - first) / turn), math.floor((upper - last) / turn)
+        # what lies beyond a limit by a rounding is not turned away from it
+        moved[:, dof] += turn * max(min(0, fewest), min(wanted, max(0, most)))
+    return moved
 
 
 def place_seeds(
