@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -30,7 +31,7 @@ def spheres(
     """Fit spheres to a URDF's collision geometry, and find the pairs of links that need no check.
 
     Every point of the geometry is inside a sphere of its link. Ignored are links that a joint joins, that touch in
-    nearly all random configurations, or in none.
+    nearly all random configurations, or in none; and, with a warning, those whose spheres alone touch in nearly all.
 
     Example: grr-torch spheres arm.urdf --out arm_spheres.yaml --spheres 20
     """
@@ -45,8 +46,8 @@ def spheres(
     with progress_bar() as progress:
         fits = fit_spheres(robot, count=count, tolerance=tolerance, starts=starts, seed=seed, progress=progress)
         by_link = {link: fit.spheres for link, fit in fits.items()}
-        pairs = find_pairs(robot, by_link, samples=samples, seed=seed, progress=progress)
-    model = SphereModel(by_link, frozenset(pair.links for pair in pairs if pair.ignored))
+        contacts = find_pairs(robot, by_link, samples=samples, seed=seed, progress=progress)
+    model = SphereModel(by_link, frozenset(pair.links for pair in contacts.pairs if pair.ignored))
     size = (
         f"--tolerance {tolerance}" if tolerance is not None else f"--spheres {count or DEFAULT_COUNT} --starts {starts}"
     )
@@ -64,7 +65,8 @@ def spheres(
                     }
                     for link, fit in fits.items()
                 },
-                "pairs": [{"links": pair.links, "reason": pair.reason, "contacts": pair.contacts} for pair in pairs],
+                "pairs": [asdict(pair) for pair in contacts.pairs],
+                "free": contacts.free,
             }
         )
         return
@@ -72,8 +74,10 @@ def spheres(
     for link, fit in fits.items():
         figures = f"{1e3 * fit.mean_excess:.1f}, {1e3 * fit.max_excess:.1f}), {1e3 * fit.uncovered:.2f}"
         typer.echo(f"  {link}: {len(fit.spheres)} ({figures}")
-    typer.echo("pairs of links that can touch (share of random configurations)")
-    for pair in pairs:
+    typer.echo("pairs of links that can touch (share of random configurations in which they do, and their spheres)")
+    for pair in contacts.pairs:
         if not pair.ignored:
-            typer.echo(f"  {pair.links[0]} – {pair.links[1]}: {100.0 * pair.contacts:.2f} %")
+            shares = f"{100.0 * pair.contacts:.2f} %, {100.0 * pair.overlaps:.2f} %"
+            typer.echo(f"  {pair.links[0]} – {pair.links[1]}: {shares}")
+    typer.echo(f"free of self-collision by the spheres: {100.0 * contacts.free:.2f} % of random configurations")
     typer.echo(f"written: {out}")

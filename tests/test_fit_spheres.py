@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from random_robots import BOX_ARM
 
-from grr_torch.errors import MeshNotFoundError, ParameterError, UrdfError
+import grr_torch
+from grr_torch.errors import GrrWarning, MeshNotFoundError, ParameterError, UrdfError
 from grr_torch.robots.contact_pairs import find_pairs
 from grr_torch.robots.fit_spheres import fit_spheres, measure
 from grr_torch.robots.geometry import Solid, link_meshes
 from grr_torch.robots.read_urdf import parse_urdf, read_urdf
-from grr_torch.robots.spheres import Sphere
+from grr_torch.robots.spheres import Sphere, SphereModel
 
 
 def outside(spheres, points):
@@ -88,7 +90,7 @@ def test_faces_between_touching_parts_are_not_surface():
 def test_pairs_are_sorted_by_what_the_geometry_can_do(fits):
     urdf = parse_urdf(BOX_ARM.encode(), source="box arm")
     spheres = {link: fit.spheres for link, fit in fits.items()}
-    reasons = {pair.links: pair for pair in find_pairs(urdf, spheres, samples=2000)}
+    reasons = {pair.links: pair for pair in find_pairs(urdf, spheres, samples=2000).pairs}
     assert reasons["base", "upper"].reason == "adjacent"
     assert reasons["fore", "hand"].reason == "adjacent"
     # the folded hand meets the upper arm, but the base lies out of its reach
@@ -100,8 +102,38 @@ def test_pairs_are_sorted_by_what_the_geometry_can_do(fits):
 def test_fat_spheres_do_not_make_contacts(fits):
     urdf = parse_urdf(BOX_ARM.encode(), source="box arm")
     fat = {link: (Sphere((0.0, 0.0, 0.1), 2.0),) for link in fits}
-    reasons = {pair.links: pair.reason for pair in find_pairs(urdf, fat, samples=300)}
+    with pytest.warns(GrrWarning, match=r"left out.*hand – upper \(spheres 100\.0 %, links \d+\.\d %\).*NOT checked"):
+        found = find_pairs(urdf, fat, samples=300)
+    reasons = {pair.links: pair.reason for pair in found.pairs}
     assert reasons["base", "fore"] == "never"
+    # a pair that is checked and always collides makes the arm useless
+    assert reasons["hand", "upper"] == "coarse"
+    assert next(pair for pair in found.pairs if pair.links == ("hand", "upper")).ignored
+    assert found.free == 1.0
+
+
+@pytest.mark.filterwarnings("error")
+def test_spheres_that_fit_are_not_warned_of(fits):
+    urdf = parse_urdf(BOX_ARM.encode(), source="box arm")
+    find_pairs(urdf, {link: fit.spheres for link, fit in fits.items()}, samples=300)
+
+
+def test_it_is_measured_how_often_spheres_touch(fits, box_arm):
+    spheres = {link: fit.spheres for link, fit in fits.items()}
+    spheres["hand"] = (Sphere((0.0, 0.0, 0.06), 0.15),)
+    urdf = read_urdf(box_arm)
+    with pytest.warns(GrrWarning, match=r"far more often than their links:.* hand – upper"):
+        found = find_pairs(urdf, spheres, samples=4000)
+    pair = next(pair for pair in found.pairs if pair.links == ("hand", "upper"))
+    assert pair.reason == "checked"
+    assert 0.0 < pair.contacts < pair.overlaps
+    model = SphereModel(spheres, frozenset(pair.links for pair in found.pairs if pair.ignored))
+    robot = grr_torch.load_robot(box_arm, spheres=model)
+    q = robot.sample(4000, torch.Generator().manual_seed(1))
+    shares = robot.collision_shares(q)
+    assert list(shares) == [("base", "hand"), ("upper", "hand")]
+    assert pair.overlaps == pytest.approx(shares["upper", "hand"], abs=0.03)
+    assert found.free == pytest.approx(1.0 - float(robot.in_self_collision(q).double().mean()), abs=0.03)
 
 
 def test_links_that_always_touch_are_ignored():
@@ -109,7 +141,7 @@ def test_links_that_always_touch_are_ignored():
     text = BOX_ARM.replace('<origin xyz="0 0 0.33"/>', '<origin xyz="0 0 -0.09"/>')
     urdf = parse_urdf(text.replace("2.9", "0.1").encode(), source="box arm")
     spheres = {link: fit.spheres for link, fit in fit_spheres(urdf, count=2, starts=0).items()}
-    reasons = {pair.links: pair.reason for pair in find_pairs(urdf, spheres, samples=200)}
+    reasons = {pair.links: pair.reason for pair in find_pairs(urdf, spheres, samples=200).pairs}
     assert reasons["hand", "upper"] == "always"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import torch
 from scipy.spatial import cKDTree
 
 import grr_torch
-from grr_torch.errors import FileFormatError, ParameterError, UnknownNameError
+from grr_torch.errors import FileFormatError, GrrWarning, ParameterError, SeedError, UnknownNameError
+from grr_torch.robots.crowding import crowding
 from grr_torch.robots.spheres import Sphere, SphereModel
 
 ARM_MESHES = {
@@ -74,6 +76,42 @@ def test_a_bad_margin_is_an_error(kinova, margin):
 def test_distance_is_differentiable(kinova, generator):
     q = kinova.sample(4, generator).requires_grad_()
     assert torch.autograd.gradcheck(kinova.self_collision_distance, (q,))
+
+
+def test_the_pairs_that_touch_are_told(kinova, generator):
+    q = kinova.sample(2000, generator)
+    shares = kinova.collision_shares(q)
+    assert set(shares) == {pair for pair in kinova.spheres.checked if pair in shares}
+    assert len(shares) == len(kinova.spheres.checked)
+    for pair, share in shares.items():
+        ignored = {tuple(sorted(other)) for other in itertools.combinations(kinova.spheres.spheres, 2)} - {
+            tuple(sorted(pair))
+        }
+        alone = replace(kinova, spheres=replace(kinova.spheres, ignored=frozenset(ignored)))
+        assert share == float(alone.in_self_collision(q).double().mean())
+    assert grr_torch.load_robot("planar_5").collision_shares(torch.zeros(3, 5)) == {}
+
+
+def crowded(box_arm, radius):
+    """An arm whose hand touches a sphere at its elbow in most configurations, or all."""
+    spheres = {"upper": (Sphere((0.0, 0.0, 0.4), radius),), "hand": (Sphere((0.0, 0.0, 0.06), 0.05),)}
+    return grr_torch.load_robot(box_arm, spheres=SphereModel(spheres, frozenset()))
+
+
+def test_a_model_by_which_nearly_everything_collides_is_named_and_not_reach(box_arm, kinova):
+    options = {"task": "position", "points": 60, "bounds": [(-0.6, 0.6)] * 2 + [(0.2, 1.0)]}
+    told = r"%d.* %% of random configurations are in self-collision, mostly upper – hand \(%d"
+    for radius, share in ((0.5, 100), (0.335, 8)):
+        with pytest.raises(SeedError, match="no seeds were found.* free of self-collision: " + told % (share, share)):
+            grr_torch.build(crowded(box_arm, radius), **options)
+    arm = crowded(box_arm, 0.339)
+    q = arm.sample(20_000, torch.Generator().manual_seed(1))
+    seed = q[~arm.in_self_collision(q)][0]
+    options["bounds"] = [(value - 0.03, value + 0.03) for value in arm.forward_kinematics(seed)[0].tolist()]
+    with pytest.warns(GrrWarning, match="^" + told % (9, 9)):
+        grr_torch.build(arm, **options, seeds=seed[None], refine=False)
+    assert crowding(kinova) == ""
+    assert crowding(crowded(box_arm, 0.1)) == ""
 
 
 def test_what_is_not_a_number_is_not_free(kinova):

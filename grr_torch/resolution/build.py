@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import GrrWarning, ParameterError
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
@@ -29,6 +30,7 @@ from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.roadmap_file import load_roadmap
 from grr_torch.resolution.seeds import SeedsLike
+from grr_torch.robots.crowding import crowding
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph
 from grr_torch.spaces.task import TaskSpace
@@ -137,6 +139,8 @@ def build(
             "reachability": reachability,
             "tolerances": asdict(tolerances),
         }
+        if crowded := crowding(robot):
+            warnings.warn(f"{crowded}: is the sphere model too coarse?", GrrWarning, stacklevel=2)
         parameters = {"method": method, **parts.chosen, **settings}
         roadmap = _assemble(robot, problem, parts, parameters, kept.seconds("building"))
         if refine:

@@ -16,6 +16,7 @@ from grr_torch.errors import SeedError
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.reachability import from_random_starts, within_reach
 from grr_torch.resolution.seeds import in_the_middle
+from grr_torch.robots.crowding import crowding
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance, wrap
 from grr_torch.spaces.graph import TaskGraph
@@ -26,6 +27,8 @@ _STARTS = 48
 _MEDOIDS = 3
 # points that are tried, as a multiple of those that are kept
 _TRIED = 3
+# of random configurations in self-collision, the share above which they may be why no point was reached
+_TELLING = 0.5
 # configurations on a closed path
 _STATIONS = 12
 
@@ -83,7 +86,10 @@ def _medoids(
         medoids.append(found[picked])
         points.append(graph.points[chosen[anchor]].to(found).expand(len(picked), -1))
     if not medoids:
-        raise SeedError(f"no seeds were found: none of {len(chosen)} points was reached from {_STARTS} random starts")
+        crowded = crowding(robot, _TELLING)
+        why = f", free of self-collision: {crowded}" if crowded else ""
+        tried = f"none of {len(chosen)} points was reached from {_STARTS} random starts"
+        raise SeedError(f"no seeds were found: {tried}{why}")
     share = len(inside) / len(graph.points) * float(valid.any(1).double().mean())
     return torch.cat(points), torch.cat(medoids), share
 

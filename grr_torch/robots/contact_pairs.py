@@ -1,12 +1,14 @@
 """Which pairs of links need no self-collision check, found from random configurations and the geometry itself.
 
 As MoveIt's Setup Assistant does: links that a joint joins, links that touch in nearly every configuration, and links
-that touch in none.
+that touch in none. Besides, links whose spheres touch in nearly every configuration though the links do not: if they
+were checked, next to no configuration would be free.
 """
 
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,16 +16,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import GrrWarning, ParameterError
 from grr_torch.progress import Progress, silent
 from grr_torch.robots.compile_tree import compile_tree, degrees_of_freedom
-from grr_torch.robots.geometry import Points, link_meshes
+from grr_torch.robots.geometry import Mask, Points, link_meshes
 from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.spheres import Sphere, ordered_pair
 from grr_torch.robots.urdf import Urdf, sampling_range
 
 # links that touch in more than this share of configurations do so by construction
 _ALWAYS = 0.95
+# spheres that touch in so much larger a share of configurations than their links are told of
+_COARSE = 0.1
+# pairs that are named in a warning
+_NAMED = 12
 _CONFIGURATIONS_AT_ONCE = 2000
 
 
@@ -33,18 +39,38 @@ class PairReport:
 
     Attributes:
         links: The pair, in alphabetical order.
-        reason: "rigid", "adjacent", "always" or "never" where it need not be checked; "checked" otherwise.
+        reason: "rigid", "adjacent", "always" or "never" where it need not be checked; "coarse" where it cannot, as the
+            spheres always touch; "checked" otherwise.
         contacts: Share of the random configurations in which the two touch (not counted for rigid and adjacent ones).
+        overlaps: Share in which their spheres do (as well).
     """
 
     links: tuple[str, str]
     reason: str
     contacts: float
+    overlaps: float = 0.0
 
     @property
     def ignored(self) -> bool:
-        """Whether the pair need not be checked."""
+        """Whether the pair is not checked."""
         return self.reason != "checked"
+
+    def __str__(self) -> str:
+        first, second = self.links
+        return f"{first} – {second} (spheres {100.0 * self.overlaps:.1f} %, links {100.0 * self.contacts:.1f} %)"
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What was found about all pairs of links.
+
+    Attributes:
+        pairs: The pairs.
+        free: Share of the random configurations in which the spheres of no checked pair touch.
+    """
+
+    pairs: list[PairReport]
+    free: float
 
 
 def find_pairs(
@@ -54,11 +80,12 @@ def find_pairs(
     samples: int = 50_000,
     seed: int = 0,
     progress: Progress = silent,
-) -> list[PairReport]:
+) -> Contacts:
     """Sorts all pairs of links that have spheres into those to check and those to ignore.
 
     Every movable joint of the URDF takes part. Contact is that of the triangles of the collision geometry: a link
-    wholly inside another one is not seen. The spheres, which hold the geometry, only tell where contact cannot be.
+    wholly inside another one is not seen. The spheres, which hold the geometry, tell where contact cannot be, and which
+    pairs they are too coarse for: those are named in a GrrWarning.
 
     Args:
         urdf: The robot.
@@ -88,11 +115,45 @@ def find_pairs(
             reports.append(PairReport(pair, "adjacent", 0.0))
         else:
             candidates.append(pair)
-    shares = _contact_shares(urdf, tree, spheres, candidates, samples, seed, progress)
-    for pair, share in zip(candidates, shares, strict=True):
-        reason = "never" if share == 0.0 else "always" if share > _ALWAYS else "checked"
-        reports.append(PairReport(pair, reason, share))
-    return reports
+    contacts, overlapping = _contacts(urdf, tree, spheres, candidates, samples, seed, progress)
+    overlaps = overlapping.mean(1).tolist()
+    found = [
+        PairReport(pair, _reason(*shares), *shares)
+        for pair, *shares in zip(candidates, contacts, overlaps, strict=True)
+    ]
+    checked = np.array([not pair.ignored for pair in found], dtype=bool)
+    _warn_of_coarse(found)
+    return Contacts(reports + found, free=1.0 - float(overlapping[checked].any(0).mean()))
+
+
+def _reason(contacts: float, overlaps: float) -> str:
+    if contacts == 0.0:
+        return "never"
+    if contacts > _ALWAYS:
+        return "always"
+    return "coarse" if overlaps > _ALWAYS else "checked"
+
+
+def _warn_of_coarse(pairs: list[PairReport]) -> None:
+    """Warns of pairs whose spheres touch far more often than the links do."""
+    help_ = "more spheres (--spheres) or descents (--starts) may"
+    left_out = [pair for pair in pairs if pair.reason == "coarse"]
+    if left_out:
+        text = (
+            f"left out, as their spheres touch in nearly all configurations though the links do not: {_names(left_out)}"
+        )
+        warnings.warn(f"{text}. Contact of these is NOT checked; {help_} tell it", GrrWarning, stacklevel=3)
+    coarse = [pair for pair in pairs if not pair.ignored and pair.overlaps - pair.contacts > _COARSE]
+    if coarse:
+        text = f"spheres touch far more often than their links: {_names(coarse)}"
+        way = "as may leaving a pair out (self_collision_ignore in the file)"
+        warnings.warn(f"{text}. Free configurations are lost by it; {help_} help, {way}", GrrWarning, stacklevel=3)
+
+
+def _names(pairs: list[PairReport]) -> str:
+    ordered = sorted(pairs, key=lambda pair: pair.contacts - pair.overlaps)
+    more = f" and {len(pairs) - _NAMED} more" if len(pairs) > _NAMED else ""
+    return ", ".join(map(str, ordered[:_NAMED])) + more
 
 
 def _group(urdf: Urdf, link: str) -> str:
@@ -102,7 +163,7 @@ def _group(urdf: Urdf, link: str) -> str:
     return link
 
 
-def _contact_shares(
+def _contacts(
     urdf: Urdf,
     tree: KinematicTree,
     spheres: Mapping[str, tuple[Sphere, ...]],
@@ -110,8 +171,8 @@ def _contact_shares(
     samples: int,
     seed: int,
     progress: Progress,
-) -> list[float]:
-    """Share of random configurations in which each pair's geometry touches."""
+) -> tuple[list[float], Mask]:
+    """Share of random configurations in which each pair's geometry touches; in which (P, samples) its spheres do."""
     import fcl
 
     links = sorted({link for pair in pairs for link in pair})
@@ -119,19 +180,21 @@ def _contact_shares(
     centres = {link: np.array([sphere.center for sphere in spheres[link]]) for link in links}
     radii = {link: np.array([sphere.radius for sphere in spheres[link]]) for link in links}
     generator = torch.Generator().manual_seed(seed)
-    contacts = np.zeros(len(pairs), dtype=np.int64)
+    contacts, overlapping = np.zeros(len(pairs), dtype=np.int64), np.zeros((len(pairs), samples), dtype=bool)
     for start in range(0, samples if pairs else 0, _CONFIGURATIONS_AT_ONCE):
         progress("testing contacts", start, samples)
         poses = _random_poses(urdf, tree, links, min(_CONFIGURATIONS_AT_ONCE, samples - start), generator)
         placed = {link: _placed(centres[link], pose) for link, pose in poses.items()}
         for index, (first, second) in enumerate(pairs):
             reach = radii[first][:, None] + radii[second]
-            for k in _near(placed[first], placed[second], reach):
+            near = _near(placed[first], placed[second], reach)
+            overlapping[index, start + np.array(near, dtype=np.int64)] = True
+            for k in near:
                 for link in (first, second):
                     objects[link].setTransform(fcl.Transform(poses[link][k, :3, :3], poses[link][k, :3, 3]))
                 contacts[index] += bool(fcl.collide(objects[first], objects[second]))
     progress("testing contacts", samples, samples)
-    return [float(count) / samples for count in contacts]
+    return [float(count) / samples for count in contacts], overlapping
 
 
 def _placed(centres: Points, poses: Points) -> Points:

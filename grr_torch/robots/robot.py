@@ -196,6 +196,21 @@ class Robot:
         """
         return self.columns_in_self_collision(self.columns(q)).reshape(q.shape[:-1])
 
+    def collision_shares(self, q: Tensor) -> dict[tuple[str, str], float]:
+        """In what share of configurations each checked pair of links is nearer than the margin; empty if none is.
+
+        Args:
+            q: (*batch, n) configurations [rad or m].
+
+        Raises:
+            ParameterError: The last axis is not n.
+        """
+        columns, kernel = self.columns(q), self._sphere_kernel
+        if kernel is None:
+            return {}
+        (touching,) = self._of_frames(lambda frames: (kernel.touching(frames, self.margin),), columns)
+        return dict(zip(kernel.names, touching.double().mean(1).tolist(), strict=True))
+
     def within_limits(self, q: Tensor, tolerance: float = 1e-9) -> Tensor:
         """Whether every joint lies within its position limits: (*batch,) bool.
 

@@ -57,7 +57,8 @@ class SphereKernel:
         bounds: (L, 1, 4) homogeneous centres of spheres that hold all of a link's, in its frame [m].
         cores: (L, 1, 4) and for each link the centre of the one of its spheres that is nearest to that.
         frames: (L,) frame of each link.
-        pairs: (2, P) indices of the pairs of links that are checked.
+        names: The P pairs of links that are checked.
+        pairs: (2, P) indices of these.
         bound_reach: (P, 1) sums of the bounding radii of each pair [m].
         core_reach: (P, 1) sums of the core spheres' radii [m].
         spheres: For each pair, its spheres.
@@ -66,6 +67,7 @@ class SphereKernel:
     bounds: Tensor
     cores: Tensor
     frames: Tensor
+    names: tuple[tuple[str, str], ...]
     pairs: Tensor
     bound_reach: Tensor
     core_reach: Tensor
@@ -93,6 +95,7 @@ class SphereKernel:
             bounds=torch.stack([centres[link][:1] for link in names]),
             cores=torch.stack([centres[link][cores[link]][None] for link in names]),
             frames=torch.tensor([tree.links[link][0] % (len(tree.joints) + 2) for link in names], device=like.device),
+            names=tuple(pairs),
             pairs=index,
             bound_reach=bound_radii[index].sum(0)[:, None],
             core_reach=core_radii[index].sum(0)[:, None],
@@ -109,7 +112,7 @@ class SphereKernel:
             near = self._squared(frames, self.bounds).sqrt() - self.bound_reach <= cutoff
         columns: list[Tensor] = []
         distances: list[Tensor] = []
-        for pair, chosen, relative in self._near(frames, near):
+        for _, pair, chosen, relative in self._near(frames, near):
             for part, squared in pair.squared_distances(relative):
                 columns.append(chosen[part])
                 # the floor keeps the gradient finite where two centres coincide
@@ -123,15 +126,27 @@ class SphereKernel:
         """Whether any checked pair of links is nearer than `margin` [m]: (N,) bool; true where a frame is NaN."""
         if frames.device.type == "cpu" and frames.shape[3] <= self._most_of_few:
             return torch.from_numpy(self._few.collides(frames.detach().numpy(), margin))
-        near = ~(self._squared(frames, self.bounds) >= (self.bound_reach + margin).square())
         hit = torch.zeros(frames.shape[3], dtype=torch.bool, device=frames.device)
+        for _, columns, touching in self._touching(frames, margin):
+            hit[columns] |= touching
+        return hit
+
+    def touching(self, frames: Tensor, margin: float) -> Tensor:
+        """Which pairs of links are nearer than `margin` [m]: (P, N) bool."""
+        hits = torch.zeros(len(self.names), frames.shape[3], dtype=torch.bool, device=frames.device)
+        for index, columns, touching in self._touching(frames, margin):
+            hits[index, columns] = touching
+        return hits
+
+    def _touching(self, frames: Tensor, margin: float) -> Iterator[tuple[int, Tensor, Tensor]]:
+        """Of each pair whose bounding spheres are near, which it is, some of its columns (M,), and where it touches."""
+        near = ~(self._squared(frames, self.bounds) >= (self.bound_reach + margin).square())
         if not bool(near.any()):
-            return hit
-        for pair, chosen, relative in self._near(frames, near):
+            return
+        for index, pair, chosen, relative in self._near(frames, near):
             limit = (pair.reach + margin).square()
             for part, squared in pair.squared_distances(relative):
-                hit[chosen[part]] |= ~(squared >= limit).flatten(0, 1).all(0)
-        return hit
+                yield index, chosen[part], ~(squared >= limit).flatten(0, 1).all(0)
 
     @cached_property
     def _most_of_few(self) -> int:
@@ -152,16 +167,17 @@ class SphereKernel:
         first, second = (placed.index_select(0, side) for side in self.pairs)
         return (first - second).square().sum(1)
 
-    def _near(self, frames: Tensor, near: Tensor) -> Iterator[tuple[_Pair, Tensor, Tensor]]:
-        """Of each pair with a near column: its spheres, those columns (M,), and poses (4, 3, M), second in first."""
+    def _near(self, frames: Tensor, near: Tensor) -> Iterator[tuple[int, _Pair, Tensor, Tensor]]:
+        """Of each pair with a near column: number, spheres, those columns (M,), poses (4, 3, M), second in first."""
         pairs, columns = near.nonzero().unbind(1)
         first, second = (_take_poses(frames, self.frames[side][pairs], columns) for side in self.pairs)
         # rows of the second frame, its origin relative to the first's, along the axes of the first: 36 multiply-adds
         rows = torch.cat([second[:3], second[3:] - first[3:]])
         relative = (rows[:, None] * first[:3]).sum(2)
         counts = near.sum(1).tolist()
-        parts = zip(self.spheres, columns.split(counts), relative.split(counts, dim=2), strict=True)
-        return (part for part in parts if len(part[1]))
+        numbers = range(len(self.spheres))
+        parts = zip(numbers, self.spheres, columns.split(counts), relative.split(counts, dim=2), strict=True)
+        return (part for part in parts if len(part[2]))
 
 
 def _take_poses(frames: Tensor, index: Tensor, columns: Tensor) -> Tensor:
