@@ -133,11 +133,11 @@ def build(
     Example: grr-torch build --robot arm.urdf --tool flange --points 2000 --bounds -0.8 0.8 -0.8 0.8 0 1.2
     --seeds seeds.csv
     """
+    from grr_torch.applications.routes import part_sizes
     from grr_torch.output import atomic_write, check_outputs
     from grr_torch.resolution.auto_seeds import CANDIDATES
     from grr_torch.resolution.build import build as build_roadmap
     from grr_torch.resolution.problem import complete_task, pose_problem
-    from grr_torch.resolution.quality import part_sizes
     from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.stages import build_stages
 

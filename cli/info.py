@@ -37,8 +37,9 @@ def info(
 
     Example: grr-torch info kinova.grr --verify
     """
+    from grr_torch.applications.routes import part_sizes
     from grr_torch.errors import ParameterError
-    from grr_torch.resolution.quality import Quality, left_out_edges, part_sizes, steep_edges
+    from grr_torch.resolution.quality import Quality, left_out_edges, steep_edges
     from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.roadmap_file import load_roadmap, read_file
     from grr_torch.resolution.verify import verify_file

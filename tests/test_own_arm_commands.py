@@ -74,7 +74,8 @@ def test_an_arm_is_built_from_its_urdf_and_tool_alone(run_cli, two_ends):
         "error: tool: got nothing; valid: one of the links (--tool), as the URDF has several ends: flange, camera\n"
     )
     code, shown, complaint = run_cli(*words, "--tool", "flange", "--no-refine")
-    assert (code, complaint) == (0, "")
+    assert code == 0
+    assert "warning" not in complaint
     # limbs of 0.4, 0.3 and 0.1 that turn 2 rad each, and 0.1 to the side
     assert "\nbounds                             -0.9 0.9 -0.9 0.9 -0.5 1.1 m\n" in shown
     assert "two_ends, position in R3\n" in shown
@@ -90,8 +91,8 @@ def test_what_leaves_z_free_is_one_warning(run_cli, two_ends):
     code, shown, complaint = run_cli(*words, "--bounds", -0.4, 0.4, -0.4, 0.4)
     assert code == 0
     assert json.loads(shown)["bounds"] == [[-0.4, 0.4], [-0.4, 0.4]]
-    assert complaint == (
-        "warning: bounds of x and y leave z free, and two_ends moves in space: six bounds give a map in space\n"
-    )
+    said = "warning: bounds of x and y leave z free, and two_ends moves in space: six bounds give a map in space\n"
+    assert said in complaint
+    assert complaint.count("warning") == 1
     words = ("build", "--robot", "planar_5", *options)
-    assert run_cli(*words, "--bounds", -0.4, 0.4, -0.4, 0.4)[2] == ""
+    assert "warning" not in run_cli(*words, "--bounds", -0.4, 0.4, -0.4, 0.4)[2]

@@ -9,7 +9,7 @@ import networkx
 import pytest
 import torch
 
-from grr_torch.resolution.quality import part_sizes
+from grr_torch.applications.routes import part_sizes
 
 
 @pytest.fixture(scope="module")

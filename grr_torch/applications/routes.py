@@ -72,3 +72,13 @@ class Routes:
         while path[-1] != goal:
             path.append(int(following[path[-1]]))
         return path
+
+
+def part_sizes(roadmap: Roadmap) -> list[int]:
+    """How many resolved vertices each connected part of a roadmap has, the largest first.
+
+    There is no path between vertices of different parts.
+    """
+    counts = np.bincount(Routes(roadmap).part[roadmap.resolved.numpy()])
+    sizes: list[int] = sorted(counts[counts > 0].tolist(), reverse=True)
+    return sizes

@@ -127,18 +127,6 @@ def measure_quality(roadmap: Roadmap, progress: Progress = silent) -> Quality:
     )
 
 
-def part_sizes(roadmap: Roadmap) -> list[int]:
-    """How many resolved vertices each part that connected edges hold together has, the largest first.
-
-    There is no path between vertices of different parts.
-    """
-    from grr_torch.applications.routes import Routes
-
-    parts = torch.from_numpy(Routes(roadmap).part)[roadmap.resolved]
-    sizes: list[int] = parts.unique(return_counts=True)[1].sort(descending=True).values.tolist()
-    return sizes
-
-
 def steep_edges(roadmap: Roadmap, max_slope: float | None = None) -> Tensor:
     """Indices (K,) of connected edges with D_q / D_p above `max_slope` [rad/m], the steepest first.
 
