@@ -6,6 +6,7 @@ import functools
 import json
 import math
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -96,15 +97,13 @@ def progress_bar() -> Iterator[ProgressBar]:
 
 @contextmanager
 def _lines(progress: ProgressBar) -> Iterator[None]:
-    """Says on standard error how far the work is, every ten seconds in which it got farther."""
-    finished = threading.Event()
+    """Says on standard error every ten seconds how long the work has taken and how far it is."""
+    begun, finished = time.perf_counter(), threading.Event()
 
     def tell() -> None:
-        said = ""
         while not finished.wait(_EVERY):
-            if progress.line != said:
-                said = progress.line
-                typer.echo(said, err=True)
+            if progress.line:
+                typer.echo(f"{_duration(time.perf_counter() - begun)} {progress.line}", err=True)
 
     # reports come when they come: between two, minutes may pass
     thread = threading.Thread(target=tell, daemon=True)
