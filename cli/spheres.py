@@ -31,7 +31,7 @@ def spheres(
     """Fit spheres to a URDF's collision geometry, and find the pairs of links that need no check.
 
     Every point of the geometry is inside a sphere of its link. Ignored are links that a joint joins, that touch in
-    nearly all random configurations, or in none; and, with a warning, those whose spheres alone touch in nearly all.
+    nearly all random configurations, or in none. Pairs whose spheres touch far more often are warned of.
 
     Example: grr-torch spheres arm.urdf --out arm_spheres.yaml --spheres 20
     """

@@ -39,8 +39,7 @@ class PairReport:
 
     Attributes:
         links: The pair, in alphabetical order.
-        reason: "rigid", "adjacent", "always" or "never" where it need not be checked; "coarse" where it cannot, as the
-            spheres always touch; "checked" otherwise.
+        reason: "rigid", "adjacent", "always" or "never" where it need not be checked; "checked" otherwise.
         contacts: Share of the random configurations in which the two touch (not counted for rigid and adjacent ones).
         overlaps: Share in which their spheres do (as well).
     """
@@ -118,7 +117,7 @@ def find_pairs(
     contacts, overlapping = _contacts(urdf, tree, spheres, candidates, samples, seed, progress)
     overlaps = overlapping.mean(1).tolist()
     found = [
-        PairReport(pair, _reason(*shares), *shares)
+        PairReport(pair, _reason(shares[0]), *shares)
         for pair, *shares in zip(candidates, contacts, overlaps, strict=True)
     ]
     checked = np.array([not pair.ignored for pair in found], dtype=bool)
@@ -126,28 +125,21 @@ def find_pairs(
     return Contacts(reports + found, free=1.0 - float(overlapping[checked].any(0).mean()))
 
 
-def _reason(contacts: float, overlaps: float) -> str:
+def _reason(contacts: float) -> str:
     if contacts == 0.0:
         return "never"
-    if contacts > _ALWAYS:
-        return "always"
-    return "coarse" if overlaps > _ALWAYS else "checked"
+    return "always" if contacts > _ALWAYS else "checked"
 
 
 def _warn_of_coarse(pairs: list[PairReport]) -> None:
     """Warns of pairs whose spheres touch far more often than the links do."""
-    help_ = "more spheres (--spheres) or descents (--starts) may"
-    left_out = [pair for pair in pairs if pair.reason == "coarse"]
-    if left_out:
-        text = (
-            f"left out, as their spheres touch in nearly all configurations though the links do not: {_names(left_out)}"
-        )
-        warnings.warn(f"{text}. Contact of these is NOT checked; {help_} tell it", GrrWarning, stacklevel=3)
     coarse = [pair for pair in pairs if not pair.ignored and pair.overlaps - pair.contacts > _COARSE]
     if coarse:
-        text = f"spheres touch far more often than their links: {_names(coarse)}"
-        way = "as may leaving a pair out (self_collision_ignore in the file)"
-        warnings.warn(f"{text}. Free configurations are lost by it; {help_} help, {way}", GrrWarning, stacklevel=3)
+        text = f"spheres touch far more often than their links: {_names(coarse)}. Free configurations are lost by it"
+        ways = (
+            "more spheres (--spheres) or descents (--starts) may help; self_collision_ignore in the file leaves it out"
+        )
+        warnings.warn(f"{text}; {ways}", GrrWarning, stacklevel=3)
 
 
 def _names(pairs: list[PairReport]) -> str:
