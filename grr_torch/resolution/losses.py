@@ -15,8 +15,11 @@ from torch import Tensor
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
-from grr_torch.resolution.edges import EdgeCheck, check_edges, continuous_edges
+from grr_torch.resolution.edges import EDGES_AT_ONCE, EdgeCheck, check_edges, continuous_edges
 from grr_torch.resolution.roadmap import Roadmap
+
+# edges of maps that are checked whole again
+_MOST_CHECKED = 4 * EDGES_AT_ONCE
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,11 @@ class FlagCheck:
         return continuous_edges(roadmap.robot, roadmap.task, *parts, self.tolerances, progress, kept, self.check).cpu()
 
 
+def is_large(roadmap: Roadmap) -> bool:
+    """Whether a map has more than 65,536 edges between resolved vertices: to check all of them again takes long."""
+    return int(roadmap.resolved[roadmap.edges].all(1).sum()) > _MOST_CHECKED
+
+
 def moved(before: Roadmap, after: Roadmap) -> Tensor:
     """(V,) vertices that are not where they were, or were not resolved."""
     old, new = before.configurations, after.configurations
@@ -61,7 +69,7 @@ def without_losses(
 
     The ends of such edges are sent back, as far as they are not where they were. If they are, the edge fails because
     others are checked beside it that were not: then what has changed nearest to it is sent back. Nothing is lost at the
-    latest when all is as it was.
+    latest when all is as it was. In large maps what has moved is checked among few others only.
 
     Args:
         before: The roadmap as it was; what it wrongly calls connected may be lost.
@@ -70,7 +78,7 @@ def without_losses(
         flags: How edges are checked.
 
     Returns:
-        The roadmap; its flags are those of all edges, checked together.
+        The roadmap; its flags are those of all edges, checked together, if it is not large.
     """
     edges = before.edges
     claimed, settled = before.connected.clone(), torch.zeros_like(before.connected)
@@ -95,7 +103,7 @@ def without_losses(
             stale = torch.zeros_like(changed).index_fill_(0, back, True)[edges].any(1)
             connected[stale] = flags.again(after, stale)
             whole = False
-        elif whole:
+        elif whole or is_large(after):
             return replace(after, connected=connected)
         else:
             connected, whole = flags.again(after), True

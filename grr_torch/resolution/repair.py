@@ -12,8 +12,8 @@ from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.checkpoint import Checkpoint, Stage
-from grr_torch.resolution.edges import EDGES_AT_ONCE, EdgeCheck
-from grr_torch.resolution.losses import FlagCheck, moved, without_losses
+from grr_torch.resolution.edges import EdgeCheck
+from grr_torch.resolution.losses import FlagCheck, is_large, moved, without_losses
 from grr_torch.resolution.quality import STEEP, edge_slopes
 from grr_torch.resolution.reachability import within_reach
 from grr_torch.resolution.roadmap import Roadmap
@@ -25,8 +25,6 @@ _STARTS = 8
 _ROUNDS = 5
 # candidates of a vertex whose edges are checked
 _CHECKED = 3
-# edges of maps that are checked whole once more
-_MOST_CHECKED = 4 * EDGES_AT_ONCE
 # what a repair changes
 _CHANGING = ("configurations", "connected", "wave")
 
@@ -87,8 +85,8 @@ def repair(
 ) -> Roadmap:
     """Resolves more vertices and connects more edges; what was connected stays so.
 
-    In maps of more than 65,536 edges between resolved vertices, repaired edges are only checked among few others, and
-    one that barely passes may be judged otherwise beside all.
+    In large maps, repaired edges are only checked among few others, and one that barely passes may be judged otherwise
+    beside all.
 
     Args:
         roadmap: The roadmap.
@@ -103,8 +101,8 @@ def repair(
     repaired = _repaired(roadmap, tolerances, seed, progress, repairing)
     if not bool(moved(roadmap, repaired).any()):
         return roadmap
-    # a check of all takes long in a large map, and what follows makes one of its own
-    if int(repaired.resolved[repaired.edges].all(1).sum()) > _MOST_CHECKED:
+    # what follows makes a check of all
+    if is_large(repaired):
         return repaired
 
     def send_back(changed: Roadmap, back: Tensor) -> Roadmap:
