@@ -208,7 +208,7 @@ class Teleoperator:
     def _normalise(self, targets: Array) -> Mask:
         """Makes the rotations of targets (B, width) those that points have; which targets are proper ones (B,)."""
         task = self.roadmap.task
-        proper: Mask = np.isfinite(targets).all(1)  # type: ignore[assignment]
+        proper: Mask = np.asarray(np.isfinite(targets).all(1), dtype=bool)
         if task.rotations is not None:
             proper &= task.rotations.are_rotations(torch.from_numpy(targets[:, task.dimension :])).numpy()
             targets[proper] = task.unit(torch.from_numpy(targets[proper])).numpy()

@@ -13,7 +13,7 @@ from grr_torch.recording.self_motion_view import in_space
 from grr_torch.spaces.rotation import matrix_from_quaternion, quaternion_from_matrix
 from grr_torch.spaces.task import Axis, TaskSpace
 
-# farther from the target than this [m], the handle is put back
+# where it is turned away from the target by as much as this [m], it is turned back
 _BESIDE = 1e-6
 
 
@@ -68,8 +68,11 @@ class Handle:
 
     def show(self, target: tuple[float, ...]) -> None:
         """Puts it to a target (width,); of what the target leaves open, it keeps its own."""
+        # in the plane it can be dragged out of it
+        if not np.allclose(self.controls.position, self._position(target), atol=1e-9):
+            self.controls.position = self._position(target)
         if self._task.gap_of_few(np.array(self.point()), np.array(target)) > _BESIDE:
-            self.controls.position, self.controls.wxyz = self._position(target), self._turned(target)
+            self.controls.wxyz = self._turned(target)
 
     def _position(self, point: tuple[float, ...]) -> np.ndarray:
         position: np.ndarray = in_space(np.array(point[: self._task.dimension])[None])[0]

@@ -140,8 +140,8 @@ class TaskSpace(ABC):
             return norms(first - second)
         turns = (torch.from_numpy(part[..., d:]) for part in (first, second))
         # the distance of rotations is 1 − cos(θ / 2)
-        half = 2.0 * np.arcsin(np.sqrt(np.clip(0.5 * self.rotations.distance(*turns).numpy(), 0.0, 1.0)))
-        return np.hypot(norms(first[..., :d] - second[..., :d]), ROTATION_WEIGHT * 2.0 * half)
+        angle = 4.0 * np.arcsin(np.sqrt(np.clip(0.5 * self.rotations.distance(*turns).numpy(), 0.0, 1.0)))
+        return np.hypot(norms(first[..., :d] - second[..., :d]), ROTATION_WEIGHT * angle)
 
     def centre(self, points: Tensor) -> Tensor:
         """The middle (*batch, width) of points (*batch, k, width) that are near each other."""
