@@ -15,6 +15,7 @@ from grr_torch.resolution.blend import blended
 from grr_torch.resolution.certify import certify
 from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.edges import EdgeCheck
+from grr_torch.resolution.losses import is_large
 from grr_torch.resolution.objectives import Objective, check_objectives, measure_objective
 from grr_torch.resolution.quality import edge_slopes, without_steep_edges
 from grr_torch.resolution.relax import Network, relax
@@ -39,7 +40,8 @@ def refine(
 
     Unresolved vertices and the ends of broken edges are tried again from all their neighbours and from random starts;
     then all configurations move along their self-motion manifolds at once. No vertex and no connected edge is lost:
-    where the relaxed map breaks an edge, its ends go back part of the way, or to where they were. With objectives, the
+    where the relaxed map breaks an edge, its ends go back part of the way, or to where they were. Edges that are broken
+    then are tried once more, in all but large maps. With objectives, the
     smoothest map is then relaxed once more, for the sum that `grr_torch.resolution.objectives` gives. At last, edges
     steeper than the roadmap's parameter `max_slope`, if it has one, are left out.
 
@@ -66,6 +68,8 @@ def refine(
     with checkpoint.timed("refinement"):
         repaired = repair(roadmap, tolerances, seed, check, progress, checkpoint)
         smoothest = _relaxed(repaired, {}, tolerances, check, progress, checkpoint)
+        if not is_large(smoothest):
+            smoothest = repair(smoothest, tolerances, seed, check, progress, checkpoint, at_last=True)
         wanted = {name: weight for name, weight in weights.items() if weight > 0.0}
         refined = _relaxed(smoothest, wanted, tolerances, check, progress, checkpoint) if wanted else smoothest
     seconds = told["seconds"] = checkpoint.seconds("refinement")

@@ -3,7 +3,7 @@
 The sum of D_q / D_p over the edges is minimised under the constraint that every tool stays where it is. Each round
 is one Gauss–Newton step: around the present configurations, the sum of the edges' weighted squares over all motions
 that the null spaces of the Jacobians allow is minimised by conjugate gradients. The weights 1 / (D_p · D_q) make
-its squares stand for the norms themselves (iteratively reweighted least squares). The first rounds begin with hops.
+its squares stand for the norms themselves (iteratively reweighted least squares). Now and then vertices hop.
 """
 
 from __future__ import annotations
@@ -28,13 +28,16 @@ from grr_torch.spaces.configuration import difference, normalise
 from grr_torch.spaces.task import TaskSpace
 
 _ROUNDS = 40
-# rounds that begin with hops; where objectives count there are none, for such a map has been relaxed without them
-_HOPS = 5
+# times that vertices hop: after the first round, and where rounds would end; where objectives count they do not, for
+# such a map has been relaxed without them
+_HOPS = 3
 # rounds end when one lowers the cost by less than this share
 _LEAST_GAIN = 2e-5
 _GRADIENT_STEPS = 60
 # conjugate gradients end when so much of the squared residual is left: the weights change from round to round
 _LEFT = 1e-3
+# that a map begins with, as a share of the stiffness
+_DAMPING = 1e-2
 # longest step of a joint [rad or m]
 _LONGEST_STEP = 0.3
 # D_q below which a slope counts as none [rad]
@@ -138,8 +141,8 @@ class Network:
         return in_pieces(measure, self.edges, self.lengths)[0]
 
     def slopes_between(self, first: Tensor, second: Tensor, lengths: Tensor) -> Tensor:
-        """(M,) D_q / D_p, rounded off at zero, between configurations (n, M) at points so far apart."""
-        moved = difference(first, second, self.robot.continuous[:, None])
+        """(…) D_q / D_p, rounded off at zero, between configurations (n, …) at points so far apart."""
+        moved = difference(first, second, self.robot.continuous.view(-1, *(1,) * (first.ndim - 1)))
         return moved.square().sum(0).add_(_SHORTEST**2).sqrt_() / lengths
 
     def by_part(self, values: Tensor) -> Tensor:
@@ -179,28 +182,29 @@ def relax(
     """Configurations (n, V) of lower cost: converged, within limits and free of self-collision like those given."""
     parts = network.part_of_vertex
     costs = network.costs(q)
-    damping = torch.full_like(costs, 1e-2)
+    damping = torch.full_like(costs, _DAMPING)
     going_on = torch.ones_like(costs, dtype=torch.bool)
-    begin = 0
+    begin, hops = 0, 0 if network.objectives else _HOPS
     if state := kept.state():
         q, costs, damping, going_on = (state[name].to(q.device) for name in ("q", "costs", "damping", "going_on"))
-        begin = int(state["done"]) if bool(going_on.any()) else rounds
+        begin, hops = (int(state["done"]) if bool(going_on.any()) else rounds), int(state["hops"])
     with one_thread(), torch.no_grad():
         for done in range(begin, rounds):
             progress("refining", done, rounds)
-            costs_before = costs
-            if done < _HOPS and not network.objectives:
-                q = hop(network, q, going_on[parts], tolerances)
-                costs = network.costs(q)
             moved = move(network, q, gauss_newton_step(network, q, damping[parts]), tolerances)
             new_costs = network.costs(moved)
             better = going_on & (new_costs < costs)
-            going_on = torch.where(better, new_costs < (1.0 - _LEAST_GAIN) * costs_before, going_on & (damping <= 1e2))
+            going_on = torch.where(better, new_costs < (1.0 - _LEAST_GAIN) * costs, going_on & (damping <= 1e2))
             q, costs = torch.where(better[parts], moved, q), torch.where(better, new_costs, costs)
             damping = torch.where(better, (0.3 * damping).clamp_min(1e-4), 10.0 * damping)
+            if hops and (done == 0 or not bool(going_on.any())):
+                q, hops = hop(network, q, tolerances), hops - 1
+                before, costs = costs, network.costs(q)
+                gained = costs < (1.0 - _LEAST_GAIN) * before
+                going_on, damping = going_on | gained, torch.where(gained, _DAMPING, damping)
             last = done + 1 == rounds or not bool(going_on.any())
-            state = {"q": q, "costs": costs, "damping": damping, "going_on": going_on, "done": torch.tensor(done + 1)}
-            kept.keep(state, last=last)
+            numbers = {"done": torch.tensor(done + 1), "hops": torch.tensor(hops)}
+            kept.keep({"q": q, "costs": costs, "damping": damping, "going_on": going_on, **numbers}, last=last)
             if last:
                 break
     progress("refining", rounds, rounds)

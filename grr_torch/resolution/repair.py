@@ -20,8 +20,9 @@ from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import TaskGraph
 
-# random starts of an unresolved vertex
+# random starts of a vertex, and, where it is resolved, starts beside its configuration, so far away [rad or m]
 _STARTS = 8
+_BESIDE, _SIDESTEP = 8, 0.2
 _ROUNDS = 5
 # candidates of a vertex whose edges are checked
 _CHECKED = 3
@@ -37,12 +38,14 @@ class _Means:
         graph: The task graph.
         tolerances: Of the projections.
         max_slope: Edges that would be steeper are not tried [rad/m].
+        beside: How many starts beside its own configuration a resolved vertex gets.
         generator: Of the random starts.
     """
 
     graph: TaskGraph
     tolerances: Tolerances
     max_slope: float
+    beside: int
     generator: torch.Generator
 
 
@@ -82,6 +85,7 @@ def repair(
     check: EdgeCheck = is_continuous,
     progress: Progress = silent,
     checkpoint: Checkpoint | None = None,
+    at_last: bool = False,
 ) -> Roadmap:
     """Resolves more vertices and connects more edges; what was connected stays so.
 
@@ -95,10 +99,17 @@ def repair(
         check: What checks all edges of what was changed.
         progress: Told what round it is.
         checkpoint: Where it is kept how far that is; nowhere by default.
+        at_last: Whether the map is smooth by now: then configurations beside that of a vertex are tried too, and edges
+            may be of any slope, not only ten times as steep as the median.
     """
     checkpoint = checkpoint or Checkpoint()
     repairing, checking = map(checkpoint.stage, ("repair", "edges-repaired"))
-    repaired = _repaired(roadmap, tolerances, seed, progress, repairing)
+    slopes, max_slope = edge_slopes(roadmap), torch.inf
+    if len(slopes):
+        max_slope = torch.inf if at_last else STEEP * float(slopes.median())
+    generator = torch.Generator().manual_seed(seed)
+    means = _Means(roadmap.graph, tolerances, max_slope, _BESIDE if at_last else 0, generator)
+    repaired = _repaired(roadmap, means, progress, repairing)
     if not bool(moved(roadmap, repaired).any()):
         return roadmap
     # what follows makes a check of all
@@ -113,11 +124,8 @@ def repair(
     return without_losses(roadmap, repaired, send_back, FlagCheck(tolerances, check, kept=checking))
 
 
-def _repaired(roadmap: Roadmap, tolerances: Tolerances, seed: int, progress: Progress, kept: Stage) -> Roadmap:
+def _repaired(roadmap: Roadmap, means: _Means, progress: Progress, kept: Stage) -> Roadmap:
     """The roadmap after all rounds, with edges as they were judged among few others."""
-    slopes = edge_slopes(roadmap)
-    max_slope = STEEP * float(slopes.median()) if len(slopes) else torch.inf
-    means = _Means(roadmap.graph, tolerances, max_slope, torch.Generator().manual_seed(seed))
     begin = 0
     if state := kept.state():
         means.generator.set_state(state["generator"])
@@ -168,12 +176,15 @@ def _independent(roadmap: Roadmap, vertices: Tensor) -> Tensor:
 
 
 def _candidates(roadmap: Roadmap, vertices: Tensor, starts: int, means: _Means) -> _Candidates:
-    """Projections of all resolved neighbours' configurations and of random ones."""
+    """Projections of all resolved neighbours' configurations, of some beside their own, and of random ones."""
     robot = roadmap.robot
     rank, other = _resolved_around(roadmap, vertices, means.graph)
-    rank = torch.cat([rank, torch.arange(len(vertices)).repeat_interleave(starts)])
+    own = roadmap.resolved[vertices].nonzero()[:, 0].repeat_interleave(means.beside)
+    beside = roadmap.configurations[vertices[own]]
+    beside = beside + _SIDESTEP * torch.randn(beside.shape, generator=means.generator, dtype=beside.dtype)
+    rank = torch.cat([rank, own, torch.arange(len(vertices)).repeat_interleave(starts)])
     random = robot.sample(len(vertices) * starts, means.generator)
-    guesses = torch.cat([roadmap.configurations[other].to(robot.lower), random])
+    guesses = torch.cat([torch.cat([roadmap.configurations[other], beside]).to(robot.lower), random])
     order = rank.sort(stable=True).indices
     rank, guesses = rank[order], guesses[order]
     targets = roadmap.points[vertices[rank]].to(guesses).T.contiguous()
