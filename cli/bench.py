@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.bench_bound import bound
 from grr_torch.cli.bench_cluster import cluster
 from grr_torch.cli.bench_devices import devices
 from grr_torch.cli.bench_effort import effort
@@ -24,6 +25,7 @@ app = typer.Typer(name="bench", help="Measure: the tables of the README.", no_ar
 
 
 app.command()(effort)
+app.command()(bound)
 app.command()(teleop)
 app.command()(learning)
 app.command()(rotations)

@@ -80,6 +80,11 @@ def estimate_memory(robot: Robot, problem: Problem, refine: bool, share: float) 
     return int(_LEAST + _MARGIN * (of_graph + of_map))
 
 
+def free_memory(device: torch.device) -> int | None:
+    """Bytes that this process may still take where tensors of a device lie; None if unknown."""
+    return available_memory() if device.type == "cpu" else _gpu_memory(device)
+
+
 def available_memory() -> int | None:
     """Bytes that this process may still take, by the system and by the limits of its control group; None if unknown."""
     found = [_system_memory(), *_group_memory()]

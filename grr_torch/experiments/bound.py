@@ -1,0 +1,202 @@
+"""How much smoother any roadmap could be: a lower bound of the mean slope, over samples of the self-motion manifolds.
+
+To choose one configuration a vertex, out of samples, so that the sum of D_q / D_p over the edges is least is a
+labelling problem. Message passing gives a bound that no choice is below, and a choice. Where both meet, nothing
+smoother is among the samples. A map's own configurations are among them, so what is between the bound and the map is
+what refinement left, but for how fine the samples are: their spacing is told.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from grr_torch.errors import ParameterError, check_seed
+from grr_torch.experiments.labelling import ENTRIES, Graph, Search
+from grr_torch.progress import Progress, silent
+from grr_torch.projection.project import Tolerances
+from grr_torch.resolution.memory import free_memory
+from grr_torch.resolution.reachability import from_random_starts
+from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.spaces.configuration import difference, distance
+
+# random starts of a vertex, for each sample that is kept
+_STARTS = 5
+# vertices whose starts are projected, and thinned, together
+_SAMPLED_TOGETHER = 64
+# bytes of an entry of a table, and how much of the free memory tables may take
+_BYTES, _SHARE = 4, 0.8
+# self-motion manifolds of more dimensions would be sampled too coarsely to tell anything
+_MOST_SPARE = 2
+# bound and choice have met when they differ by less than this share
+_MET = 1e-5
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What can be reached at most.
+
+    Attributes:
+        robot: The robot's name.
+        task: The kind of task.
+        vertices: Resolved vertices.
+        edges: Edges between them, broken ones included.
+        left_out: How many of these edges a map may leave out.
+        samples: Of each self-motion manifold.
+        spacing: Median and largest distance of a configuration from the nearest sample [rad; sliding joints in m].
+        iterations: Of the message passing.
+        smoothness: Of the given map, over the edges but its steepest `left_out` [rad/m].
+        best: Of the smoothest choice found, likewise; it need not be continuous along every edge.
+        bound: What no choice of samples is below.
+        seconds: What it took.
+    """
+
+    robot: str
+    task: str
+    vertices: int
+    edges: int
+    left_out: int
+    samples: int
+    spacing: tuple[float, float]
+    iterations: int
+    smoothness: float
+    best: float
+    bound: float
+    seconds: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        return asdict(self)
+
+
+def measure_bound(
+    roadmap: Roadmap,
+    *,
+    samples: int = 300,
+    iterations: int = 60,
+    left_out: int = 0,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Bound:
+    """Bounds the mean slope over the edges between a roadmap's resolved vertices from below.
+
+    For maps that leave out some edges, slopes count up to the k-th steepest of the given map, τ: of E edges whose
+    truncated slopes have a mean of at least b, any E − k have one of at least (E b − k τ) / (E − k).
+
+    Args:
+        roadmap: The roadmap, on the device that is to be used.
+        samples: Of each self-motion manifold, the map's own configuration among them.
+        iterations: Of the message passing, at most.
+        left_out: How many edges k may be left out.
+        seed: Of the random starts.
+        progress: Told what is being done and how far it is.
+
+    Raises:
+        ParameterError: A number is out of its range, the task leaves more than two degrees of freedom, no edge
+            is between resolved vertices, or the tables do not fit the memory.
+    """
+    begin = time.perf_counter()
+    vertices = roadmap.resolved.nonzero()[:, 0]
+    graph = Graph.of(roadmap, vertices, roadmap.robot.device)
+    _check(roadmap, len(graph.low), samples, iterations, left_out)
+    labels, spacing = _sampled(roadmap, vertices, samples, check_seed(seed), progress)
+    own = torch.zeros(len(vertices), dtype=torch.long, device=labels.device)
+    slopes = _slopes(roadmap, graph, labels, own)
+    truncated = float(slopes.topk(left_out).values[-1]) if left_out else torch.inf
+    search = Search(graph, _tables(roadmap, graph, labels, truncated, progress))
+    done = 0
+    while done < iterations and search.best - search.bound > _MET * search.best:
+        progress("passing messages", done, iterations)
+        search.go_on()
+        done += 1
+    progress("passing messages", iterations, iterations)
+    edges = len(slopes)
+    smoothness = _mean_without(slopes, left_out)
+    best = min(smoothness, _mean_without(_slopes(roadmap, graph, labels, search.chosen), left_out))
+    bound = (search.bound - (left_out * truncated if left_out else 0.0)) / (edges - left_out)
+    return Bound(
+        robot=roadmap.robot.name,
+        task=roadmap.task.kind,
+        vertices=len(vertices),
+        edges=edges,
+        left_out=left_out,
+        samples=samples,
+        spacing=(float(spacing.median()), float(spacing.max())),
+        iterations=done,
+        smoothness=smoothness,
+        best=best,
+        # where both meet, rounding may put it above
+        bound=min(bound, best),
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def _check(roadmap: Roadmap, edges: int, samples: int, iterations: int, left_out: int) -> None:
+    spare = roadmap.robot.n - roadmap.task.constraints
+    if spare > _MOST_SPARE:
+        raise ParameterError("roadmap", f"a task that leaves {spare} degrees of freedom", f"{_MOST_SPARE} or fewer")
+    if edges == 0:
+        raise ParameterError("roadmap", "no edge between resolved vertices", "a roadmap with some")
+    if iterations < 1:
+        raise ParameterError("iterations", iterations, "1 or more")
+    if not 0 <= left_out < edges:
+        raise ParameterError("left_out", left_out, f"0 to {edges - 1:,}, of {edges:,} edges")
+    free = free_memory(roadmap.robot.device)
+    fitting = None if free is None else int((_SHARE * free / (_BYTES * edges)) ** 0.5)
+    if samples < 2 or (fitting is not None and samples > fitting):
+        most = "" if fitting is None else f", and up to {fitting:,} fit the memory that is free"
+        raise ParameterError("samples", samples, f"2 or more{most}")
+
+
+def _sampled(roadmap: Roadmap, vertices: Tensor, samples: int, seed: int, progress: Progress) -> tuple[Tensor, Tensor]:
+    """(V, L, n) configurations that lie far apart, the map's own first, and the spacing (V,) of each vertex's."""
+    robot, device = roadmap.robot, roadmap.robot.device
+    generator = torch.Generator().manual_seed(seed)
+    tolerances = Tolerances(**roadmap.parameters["tolerances"])
+    labels: list[Tensor] = []
+    spacing: list[Tensor] = []
+    for part in vertices.split(_SAMPLED_TOGETHER):
+        progress("sampling self-motion manifolds", len(labels) * _SAMPLED_TOGETHER, len(vertices))
+        starts = _STARTS * samples
+        found, valid = from_random_starts(robot, roadmap.task, roadmap.points[part], starts, generator, tolerances)
+        found, valid = found.to(device).nan_to_num(), valid.to(device)
+        last = roadmap.configurations[part].to(found)
+        kept, row = [last], torch.arange(len(part), device=device)
+        apart = torch.where(valid, torch.inf, 0.0).to(found)
+        for _ in range(samples):
+            apart = torch.minimum(apart, distance(found, last[:, None], robot.continuous))
+            # where none is left, one comes twice
+            last = found[row, apart.argmax(1)]
+            last = torch.where((apart.amax(1) > 0.0)[:, None], last, kept[0])
+            kept.append(last)
+        labels.append(torch.stack(kept[:-1], dim=1).float())
+        spacing.append(apart.amax(1))
+    return torch.cat(labels), torch.cat(spacing).cpu()
+
+
+def _slopes(roadmap: Roadmap, graph: Graph, labels: Tensor, chosen: Tensor) -> Tensor:
+    """(E,) D_q / D_p of a choice (V,) of labels (V, L, n)."""
+    q = labels[torch.arange(len(chosen), device=chosen.device), chosen]
+    return (distance(q[graph.low], q[graph.high], roadmap.robot.continuous) / graph.lengths).double()
+
+
+def _mean_without(slopes: Tensor, left_out: int) -> float:
+    return float(slopes.sort().values[: len(slopes) - left_out].mean())
+
+
+def _tables(roadmap: Roadmap, graph: Graph, labels: Tensor, truncated: float, progress: Progress) -> Tensor:
+    """(E, L, L) slopes of all edges, by the labels of their ends."""
+    edges, size = len(graph.low), labels.shape[1]
+    tables = labels.new_zeros(edges, size, size)
+    for part in torch.arange(edges, device=labels.device).split(max(1, ENTRIES // size**2)):
+        progress("tables of slopes", int(part[0]), edges)
+        low, high = labels[graph.low[part]], labels[graph.high[part]]
+        table = tables[part[0] : part[-1] + 1]
+        for joint, wraps in enumerate(roadmap.robot.continuous):
+            table += difference(low[:, :, None, joint], high[:, None, :, joint], wraps).square()
+        table.sqrt_().div_(graph.lengths[part, None, None]).clamp_(max=truncated)
+    return tables
