@@ -10,6 +10,8 @@ import torch
 
 import grr_torch
 from grr_torch.errors import ParameterError
+from grr_torch.resolution.options import slope_bound
+from grr_torch.resolution.problem import pose_problem
 from grr_torch.resolution.quality import edge_slopes, left_out_edges, steep_edges
 from grr_torch.resolution.refine import refine
 from grr_torch.resolution.verify import verify_file
@@ -71,10 +73,34 @@ def test_refining_again_keeps_the_bound(pair):
     assert again.quality().smoothness_max <= again.parameters["max_slope"] == BOUNDS[bounded.robot.name]
 
 
-@pytest.mark.parametrize("bound", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("bound", [0.0, -1.0, math.nan, -math.inf])
 def test_a_bound_is_a_positive_number(planar_5, bound):
     with pytest.raises(ParameterError, match="max_slope"):
         grr_torch.build(planar_5, "position", points=50, max_slope=bound)
+
+
+def test_the_preset_bounds_its_own_grid_alone(kinova):
+    bounds = {
+        "of the preset": grr_torch.build(kinova, "position", refine=False),
+        "other points": grr_torch.build(kinova, "position", points=400, refine=False),
+        "other task": grr_torch.build(kinova, "fixed-rotation", refine=False),
+        "given": grr_torch.build(kinova, "position", refine=False, max_slope=10.0),
+        "none": grr_torch.build(kinova, "position", refine=False, max_slope=math.inf),
+    }
+    preset = kinova.preset.problems["position"].max_slope
+    found = {name: roadmap.parameters["max_slope"] for name, roadmap in bounds.items()}
+    assert found == {"of the preset": preset, "other points": None, "other task": None, "given": 10.0, "none": None}
+    whole, left = bounds["none"], bounds["of the preset"]
+    assert torch.equal(left.connected, whole.connected.index_fill(0, steep_edges(whole, preset), False))
+    assert int(left.connected.sum()) >= 0.998 * len(left.edges[left.resolved[left.edges].all(1)])
+
+
+def test_random_grr_has_no_bound_of_the_preset(kinova):
+    graph = grr_torch.build(kinova, "position", points=60, refine=False).graph
+    problem = pose_problem(kinova, "position")
+    assert problem.max_slope is not None
+    assert slope_bound(None, problem, "random") is None
+    assert slope_bound(None, pose_problem(kinova, "position", graph), "expansion") is None
 
 
 def test_the_commands_take_a_bound_and_list_what_is_left_out(run_cli):

@@ -21,7 +21,7 @@ from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.edges import EdgeCheck, continuous_edges
 from grr_torch.resolution.expand import default_neighbours, expand
 from grr_torch.resolution.memory import require_memory
-from grr_torch.resolution.options import check_options, describe_build
+from grr_torch.resolution.options import check_options, describe_build, slope_bound
 from grr_torch.resolution.problem import Problem, pose_problem
 from grr_torch.resolution.quality import without_steep_edges
 from grr_torch.resolution.random_grr import random_grr
@@ -81,7 +81,8 @@ def build(
         objectives: Weights of "clearance", "manipulability" and "limits", which refinement serves besides smoothness;
             at weight 1, 1 % of an objective's mean is worth 1 % of smoothness.
         max_slope: Edges with D_q / D_p above this [rad/m] are not connected in the end, though continuous: there small
-            moves of the hand are large ones of the arm. No bound by default.
+            moves of the hand are large ones of the arm. inf: no bound. By default that of the preset's grid, if it has
+            one and the method is expansion; otherwise none.
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. On the CPU the same inputs give the same tensors.
         tolerances: When a configuration counts as being at a point.
@@ -103,6 +104,7 @@ def build(
         OutputError: The checkpoint cannot be written, is there without `resume`, or another build is using it.
     """
     problem = pose_problem(robot, task, points, bounds, seeds, rotations)
+    max_slope = slope_bound(max_slope, problem, method)
     options: dict[str, Any] = {
         "method": method,
         "candidates": candidates,
@@ -238,15 +240,15 @@ def _with_seeds(
     kept: Checkpoint,
 ) -> Problem:
     """The problem with seeds that are found, where none are given."""
-    task, graph, seeds = problem
-    if not isinstance(seeds, str):
+    if not isinstance(problem.seeds, str):
         return problem
 
     def find() -> dict[str, Tensor]:
         options = {"candidates": candidates, "seed": seed}
-        return {"seeds": find_seeds(robot, task, graph, **options, tolerances=tolerances, progress=progress)}
+        found = find_seeds(robot, problem.task, problem.graph, **options, tolerances=tolerances, progress=progress)
+        return {"seeds": found}
 
-    return Problem(task, graph, kept.once("seeds", find)["seeds"].to(robot.device))
+    return problem._replace(seeds=kept.once("seeds", find)["seeds"].to(robot.device))
 
 
 def _expanded(
@@ -260,7 +262,7 @@ def _expanded(
     *,
     warn: bool,
 ) -> _Parts:
-    task, graph, table = problem
+    task, graph, table = problem[:3]
     assert not isinstance(table, str)
     expansion = expand(
         robot,

@@ -52,8 +52,8 @@ def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> 
     if not 0 <= reachability <= _MOST_STARTS:
         raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
     max_slope = options["max_slope"]
-    if max_slope is not None and not 0.0 < max_slope < math.inf:
-        raise ParameterError("max_slope", max_slope, "above 0 and finite, in rad/m")
+    if max_slope is not None and not max_slope > 0.0:
+        raise ParameterError("max_slope", max_slope, "above 0, in rad/m; inf: no bound")
     if method not in METHODS:
         raise UnknownNameError("method", method, METHODS)
     check_candidates(options["candidates"])
@@ -74,6 +74,13 @@ def _check_problem(robot: Robot, task: TaskSpace, points: Any, bounds: Any, rota
         check_rotations(rotations)
     if seeds is not None and not isinstance(seeds, str):
         check_seeds(robot, seeds)
+
+
+def slope_bound(given: float | None, problem: Problem, method: str) -> float | None:
+    """The `max_slope` of a roadmap: what is given, or for an expansion the problem's own; None: no bound."""
+    if given is None:
+        return problem.max_slope if method == "expansion" else None
+    return None if given == math.inf else given
 
 
 def describe_build(robot: Robot, problem: Problem, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -26,11 +26,13 @@ class Problem(NamedTuple):
         task: The task space.
         graph: Its task graph.
         seeds: A table of configurations, or "auto".
+        max_slope: D_q / D_p above which edges are left out unless told otherwise [rad/m]; None: no bound.
     """
 
     task: TaskSpace
     graph: TaskGraph
     seeds: SeedsLike | str
+    max_slope: float | None = None
 
 
 def pose_problem(
@@ -167,7 +169,9 @@ def _complete(
         graph = _turned(task, graph, rotations, problem)
     if graph.points.shape[1] != task.width:
         raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.width} for {task.name}")
-    return Problem(task, graph, seeds)
+    # slopes depend on how fine a grid is
+    of_preset = problem is not None and points is None and bounds is None
+    return Problem(task, graph, seeds, problem.max_slope if problem is not None and of_preset else None)
 
 
 def _grid(

@@ -21,6 +21,7 @@ class Problem:
         seeds: Configurations the expansion starts from.
         rotation: Fixed-axis roll, pitch, yaw of the tool [rad], for `fixed-rotation`, and for `yaw` at yaw 0.
         rotations: How many rotations the grid has, where rotation varies.
+        max_slope: D_q / D_p above which edges of this very grid are left out [rad/m]; None: no bound.
     """
 
     points: int
@@ -28,6 +29,7 @@ class Problem:
     seeds: tuple[tuple[float, ...], ...]
     rotation: tuple[float, float, float] | None
     rotations: int | None = None
+    max_slope: float | None = None
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,7 @@ def _problem(entry: Mapping[str, Any]) -> Problem:
         seeds=tuple(tuple(map(float, seed)) for seed in entry["seeds"]),
         rotation=None if rotation is None else (float(rotation[0]), float(rotation[1]), float(rotation[2])),
         rotations=entry.get("rotations"),
+        max_slope=entry.get("max_slope"),
     )
 
 
