@@ -17,6 +17,7 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError, check_seed
 from grr_torch.experiments.labelling import ENTRIES, Graph, Search
+from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.memory import free_memory
@@ -163,19 +164,23 @@ def _sampled(roadmap: Roadmap, vertices: Tensor, samples: int, seed: int, progre
         progress("sampling self-motion manifolds", len(labels) * _SAMPLED_TOGETHER, len(vertices))
         starts = _STARTS * samples
         found, valid = from_random_starts(robot, roadmap.task, roadmap.points[part], starts, generator, tolerances)
-        found, valid = found.to(device).nan_to_num(), valid.to(device)
-        last = roadmap.configurations[part].to(found)
-        kept, row = [last], torch.arange(len(part), device=device)
-        apart = torch.where(valid, torch.inf, 0.0).to(found)
-        for _ in range(samples):
-            apart = torch.minimum(apart, distance(found, last[:, None], robot.continuous))
-            # where none is left, one comes twice
-            last = found[row, apart.argmax(1)]
-            last = torch.where((apart.amax(1) > 0.0)[:, None], last, kept[0])
-            kept.append(last)
-        labels.append(torch.stack(kept[:-1], dim=1).float())
-        spacing.append(apart.amax(1))
+        found = torch.where(valid[..., None], found, roadmap.configurations[part, None]).float().to(device)
+        kept, apart = _far_apart(found, roadmap.configurations[part].float().to(device), robot.continuous, samples)
+        labels.append(kept)
+        spacing.append(apart)
     return torch.cat(labels), torch.cat(spacing).cpu()
+
+
+def _far_apart(found: Tensor, first: Tensor, continuous: Tensor, samples: int) -> tuple[Tensor, Tensor]:
+    """Of configurations (K, N, n), some (K, L, n) that lie far apart, `first` (K, n) first; how far (K,) others are."""
+    row = torch.arange(len(found), device=found.device)
+    kept, apart = [first], torch.full_like(found[..., 0], torch.inf)
+    # short calls, for which threads would wait for each other
+    with one_thread():
+        for _ in range(samples):
+            apart = torch.minimum(apart, distance(found, kept[-1][:, None], continuous))
+            kept.append(found[row, apart.argmax(1)])
+    return torch.stack(kept[:-1], dim=1), apart.amax(1)
 
 
 def _slopes(roadmap: Roadmap, graph: Graph, labels: Tensor, chosen: Tensor) -> Tensor:
