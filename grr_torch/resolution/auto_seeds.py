@@ -3,7 +3,7 @@
 All candidates, those of `closed_paths`, are expanded over a coarse graph and the best of them relaxed there: so few
 vertices soon come to rest, and many candidates come to nearly the same. The best of these maps, as seeds, are expanded
 and relaxed on the task graph itself; the one with the smallest slopes, where what is missing or broken counts as steep,
-seeds the roadmap with all its vertices. Of a large task graph, the best coarse map does.
+is relaxed further and seeds the roadmap with all its vertices. Of a large task graph, the best coarse map does.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ _FINALISTS = 0.03
 # in so many rounds each
 _ROUNDS = 5
 _FINAL_ROUNDS = 3
+# and of the best of these
+_LAST_ROUNDS = 10
 # edges steeper than this many times the median are not relaxed
 _STEEP = 6.0
 # an edge that is missing, broken, or steeper, counts as this many times the smallest median of slopes
@@ -118,6 +120,7 @@ def find_seeds(
     slopes = _slopes(robot, task, graph, maps)
     slopes[_broken(robot, task, graph, maps, slopes, tolerances)] = torch.nan
     best = maps[int(_sums(slopes).argmin())]
+    best = _relaxed(robot, task, graph, best[None], tolerances, _LAST_ROUNDS)[0]
     found = best[~best.isnan().any(1)]
     # on a graph with few vertices within reach none may have been placed
     return in_the_middle(robot, found) if len(found) else finalists[0]
