@@ -25,10 +25,11 @@ def bound(
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
     json_file: FiguresFile = None,
 ) -> None:
-    """Print how much smoother than a roadmap any other could be, as a Markdown table.
+    """Print how much smoother than a roadmap another could be, as a Markdown table.
 
     Self-motion manifolds are sampled, and message passing over all edges gives a bound that no choice among the
-    samples is below. Takes some minutes, and 4 bytes for each edge and pair of samples.
+    samples is below. Maps between the samples may be smoother, the less the closer these lie. Takes some minutes,
+    and 4 bytes for each edge and pair of samples.
 
     Example: grr-torch bench bound kinova.grr --samples 400 --leave-out 0 --leave-out 10
     """
@@ -39,12 +40,10 @@ def bound(
     check_outputs({"--json": json_file}, [file])
     roadmap = Roadmap.load(file, device=device)
     with progress_bar() as progress:
-        results = [
-            measure_bound(
-                roadmap, samples=samples, iterations=iterations, left_out=number, seed=seed, progress=progress
-            )
-            for number in dict.fromkeys(leave_out or [0])
-        ]
+        numbers = list(dict.fromkeys(leave_out or [0]))
+        results = measure_bound(
+            roadmap, samples=samples, iterations=iterations, left_out=numbers, seed=seed, progress=progress
+        )
     write_figures(json_file, {"file": str(file), "bounds": [result.to_dict() for result in results]})
     show_machine()
     head = ["problem", "edges", "samples, spacing [rad]", "this roadmap", "smoothest found", "bound", "time [s]"]

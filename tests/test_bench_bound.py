@@ -10,7 +10,7 @@ import torch
 
 import grr_torch
 from grr_torch.errors import ParameterError
-from grr_torch.experiments.bound import measure_bound
+from grr_torch.experiments.bound import bound_without, mean_without, measure_bound
 from grr_torch.experiments.labelling import Graph, Search
 from grr_torch.resolution.refine import refine
 
@@ -54,6 +54,36 @@ def test_no_choice_is_below_the_bound_and_the_one_found_is_real(edges, generator
         assert sum(gap < 1e-5 for gap in gaps) > 10
 
 
+@pytest.mark.parametrize("left_out", [1, 2])
+def test_no_choice_that_leaves_edges_out_is_below_the_bound(left_out, generator):
+    net = graph(LOOPS)
+    edges = torch.arange(len(LOOPS))
+    choices = torch.tensor(list(itertools.product(range(3), repeat=5)))
+    met = 0
+    for _ in range(20):
+        tables = torch.rand(len(LOOPS), 3, 3, generator=generator)
+        truncated = float(tables[:, 0, 0].topk(left_out).values[-1])
+        search = Search(net, tables.clamp(max=truncated))
+        for _ in range(20):
+            search.go_on()
+        least = min(mean_without(tables[edges, one[net.low], one[net.high]], left_out) for one in choices)
+        bound = bound_without(search.bound, len(LOOPS), left_out, truncated)
+        assert bound <= least + 1e-5
+        met += bound > least - 0.1
+    assert met > 3, "a bound that is always far below tells nothing"
+
+
+def test_edges_and_levels_are_those_of_the_roadmap(plain):
+    vertices = plain.resolved.nonzero()[:, 0]
+    net = Graph.of(plain, vertices, torch.device("cpu"))
+    joined = plain.edges[plain.resolved[plain.edges].all(1)]
+    assert {tuple(pair) for pair in vertices[edges_of(net).T].tolist()} == {tuple(pair) for pair in joined.tolist()}
+    assert torch.allclose(net.lengths.double(), (plain.points[joined[:, 0]] - plain.points[joined[:, 1]]).norm(dim=1))
+    assert bool((net.levels[net.low] < net.levels[net.high]).all())
+    before, behind = (end.bincount(minlength=len(vertices)) for end in (net.high, net.low))
+    assert torch.allclose(net.shares, 1.0 / torch.maximum(before, behind).clamp_min(1))
+
+
 def edges_of(net: Graph) -> torch.Tensor:
     return torch.stack([net.low, net.high])
 
@@ -65,8 +95,10 @@ def plain() -> grr_torch.Roadmap:
 
 def test_refinement_comes_near_the_bound_and_not_below(plain):
     refined = refine(plain)
-    before, after = (measure_bound(roadmap, samples=60, iterations=40) for roadmap in (plain, refined))
-    assert after.bound <= after.best <= after.smoothness < before.smoothness
+    before, after = (measure_bound(roadmap, samples=60, iterations=40)[0] for roadmap in (plain, refined))
+    assert after.bound <= after.best * (1.0 + 1e-6)
+    assert after.best <= after.smoothness < before.smoothness
+    assert after.smoothness == pytest.approx(refined.quality().smoothness, rel=1e-6)
     assert after.smoothness == pytest.approx(refined.quality().smoothness, rel=1e-6)
     assert after.bound > 0.98 * after.smoothness
     assert 0.0 < after.spacing[0] < after.spacing[1]
@@ -74,15 +106,16 @@ def test_refinement_comes_near_the_bound_and_not_below(plain):
 
 
 def test_the_more_edges_are_left_out_the_lower_is_the_bound(plain):
-    results = [measure_bound(plain, samples=30, iterations=20, left_out=number) for number in (0, 3, 10)]
+    results = measure_bound(plain, samples=30, iterations=20, left_out=(0, 3, 10))
     bounds = [result.bound for result in results]
     assert bounds == sorted(bounds, reverse=True)
     assert len(set(bounds)) == 3
-    assert all(result.bound <= result.best <= result.smoothness for result in results)
+    assert all(result.bound <= result.best * (1.0 + 1e-6) for result in results)
+    assert all(result.best <= result.smoothness for result in results)
 
 
 @pytest.mark.parametrize(
-    "options", [{"samples": 1}, {"samples": 10**6}, {"iterations": 0}, {"left_out": -1}, {"left_out": 10**6}]
+    "options", [{"samples": 1}, {"samples": 10**6}, {"iterations": 0}, {"left_out": [-1]}, {"left_out": [0, 10**6]}]
 )
 def test_numbers_out_of_their_range_are_errors(plain, options):
     with pytest.raises(ParameterError):
@@ -114,7 +147,7 @@ def test_the_command_prints_a_table_and_writes_json(plain, run_cli, tmp_path):
     assert out.count("planar_5 fixed-rotation") == 2
     written = json.loads((tmp_path / "bound.json").read_text())
     assert [one["left_out"] for one in written["bounds"]] == [0, 2]
-    assert all(one["bound"] <= one["best"] for one in written["bounds"])
+    assert all(one["bound"] <= one["best"] * (1.0 + 1e-6) for one in written["bounds"])
 
 
 @pytest.mark.parametrize("words", [["none.grr"], ["map.grr", "--samples", "1"], ["map.grr", "--json", "map.grr"]])

@@ -10,12 +10,15 @@ import torch
 
 import grr_torch
 from grr_torch.errors import ParameterError
+from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.options import slope_bound
 from grr_torch.resolution.problem import pose_problem
-from grr_torch.resolution.quality import edge_slopes, left_out_edges, steep_edges
+from grr_torch.resolution.quality import edge_slopes, left_out_edges, steep_edges, without_steep_edges
 from grr_torch.resolution.refine import refine
+from grr_torch.resolution.repair import repair
 from grr_torch.resolution.verify import verify_file
 from grr_torch.spaces.configuration import distance
+from grr_torch.spaces.graph import staggered_grid
 
 BOUNDS = {"planar_5": 12.0, "kinova": 5.0}
 
@@ -96,11 +99,33 @@ def test_the_preset_bounds_its_own_grid_alone(kinova):
 
 
 def test_random_grr_has_no_bound_of_the_preset(kinova):
-    graph = grr_torch.build(kinova, "position", points=60, refine=False).graph
     problem = pose_problem(kinova, "position")
     assert problem.max_slope is not None
     assert slope_bound(None, problem, "random") is None
-    assert slope_bound(None, pose_problem(kinova, "position", graph), "expansion") is None
+
+
+def test_the_preset_bounds_its_grid_however_it_is_given(kinova):
+    problem = pose_problem(kinova, "position")
+    bound = kinova.preset.problems["position"].max_slope
+    assert pose_problem(kinova, "position", problem.graph).max_slope == bound
+    assert pose_problem(kinova, "position", kinova.preset.problems["position"].points).max_slope == bound
+    assert pose_problem(kinova, "position", staggered_grid([(0.2, 0.6)] * 3, 50)).max_slope is None
+
+
+@pytest.mark.parametrize(("given", "expected"), [([], 15.6), (["--max-slope", "inf"], None)])
+def test_the_command_takes_the_bound_of_the_preset(run_cli, given, expected):
+    words = ["build", "--robot", "kinova", "--task", "position", "--no-refine", "--out", "m.grr", "--no-record"]
+    code, _, _ = run_cli(*words, *given)
+    assert code == 0
+    assert grr_torch.Roadmap.load("m.grr").parameters["max_slope"] == expected
+
+
+def test_a_last_repair_moves_nothing_for_edges_that_are_left_out(pair):
+    _, bounded = pair
+    repaired = without_steep_edges(repair(bounded, Tolerances(), 0, at_last=True))
+    assert bool(repaired.connected[bounded.connected].all())
+    moved = (repaired.configurations != bounded.configurations)[bounded.resolved].any()
+    assert int(repaired.connected.sum()) > int(bounded.connected.sum()) or not bool(moved)
 
 
 def test_the_commands_take_a_bound_and_list_what_is_left_out(run_cli):

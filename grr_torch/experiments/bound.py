@@ -1,14 +1,15 @@
-"""How much smoother any roadmap could be: a lower bound of the mean slope, over samples of the self-motion manifolds.
+"""How much smoother a roadmap could be: a lower bound of the mean slope, among samples of the self-motion manifolds.
 
 To choose one configuration a vertex, out of samples, so that the sum of D_q / D_p over the edges is least is a
 labelling problem. Message passing gives a bound that no choice is below, and a choice. Where both meet, nothing
 smoother is among the samples. A map's own configurations are among them, so what is between the bound and the map is
-what refinement left, but for how fine the samples are: their spacing is told.
+what refinement left; a map between the samples may be a little smoother still, so their spacing is told.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -48,7 +49,8 @@ class Bound:
         edges: Edges between them, broken ones included.
         left_out: How many of these edges a map may leave out.
         samples: Of each self-motion manifold.
-        spacing: Median and largest distance of a configuration from the nearest sample [rad; sliding joints in m].
+        spacing: How far the random start that is farthest from a vertex's samples is from the nearest of them, median
+            and maximum over the vertices [rad; sliding joints in m].
         iterations: Of the message passing.
         smoothness: Of the given map, over the edges but its steepest `left_out` [rad/m].
         best: Of the smoothest choice found, likewise; it need not be continuous along every edge.
@@ -79,25 +81,24 @@ def measure_bound(
     *,
     samples: int = 300,
     iterations: int = 60,
-    left_out: int = 0,
+    left_out: Sequence[int] = (0,),
     seed: int = 0,
     progress: Progress = silent,
-) -> Bound:
-    """Bounds the mean slope over the edges between a roadmap's resolved vertices from below.
+) -> list[Bound]:
+    """Bounds the mean slope over the edges between a roadmap's resolved vertices from below, among samples.
 
-    For maps that leave out some edges, slopes count up to the k-th steepest of the given map, τ: of E edges whose
-    truncated slopes have a mean of at least b, any E − k have one of at least (E b − k τ) / (E − k).
+    A map whose configurations lie between the samples may be smoother, the less the finer they are.
 
     Args:
         roadmap: The roadmap, on the device that is to be used.
         samples: Of each self-motion manifold, the map's own configuration among them.
         iterations: Of the message passing, at most.
-        left_out: How many edges k may be left out.
+        left_out: How many edges may be left out; a bound for each such number.
         seed: Of the random starts.
         progress: Told what is being done and how far it is.
 
     Raises:
-        ParameterError: A number is out of its range, the task leaves more than two degrees of freedom, no edge
+        ParameterError: A number is out of its range, the task does not leave one or two degrees of freedom, no edge
             is between resolved vertices, or the tables do not fit the memory.
     """
     begin = time.perf_counter()
@@ -107,45 +108,62 @@ def measure_bound(
     labels, spacing = _sampled(roadmap, vertices, samples, check_seed(seed), progress)
     own = torch.zeros(len(vertices), dtype=torch.long, device=labels.device)
     slopes = _slopes(roadmap, graph, labels, own)
-    truncated = float(slopes.topk(left_out).values[-1]) if left_out else torch.inf
-    search = Search(graph, _tables(roadmap, graph, labels, truncated, progress))
-    done = 0
-    while done < iterations and search.best - search.bound > _MET * search.best:
-        progress("passing messages", done, iterations)
-        search.go_on()
-        done += 1
-    progress("passing messages", iterations, iterations)
-    edges = len(slopes)
-    smoothness = _mean_without(slopes, left_out)
-    best = min(smoothness, _mean_without(_slopes(roadmap, graph, labels, search.chosen), left_out))
-    bound = (search.bound - (left_out * truncated if left_out else 0.0)) / (edges - left_out)
-    return Bound(
-        robot=roadmap.robot.name,
-        task=roadmap.task.kind,
-        vertices=len(vertices),
-        edges=edges,
-        left_out=left_out,
-        samples=samples,
-        spacing=(float(spacing.median()), float(spacing.max())),
-        iterations=done,
-        smoothness=smoothness,
-        best=best,
-        # where both meet, rounding may put it above
-        bound=min(bound, best),
-        seconds=time.perf_counter() - begin,
-    )
+    bounds: list[Bound] = []
+    for number in left_out:
+        truncated = float(slopes.topk(number).values[-1]) if number else torch.inf
+        search = Search(graph, _tables(roadmap, graph, labels, truncated, progress))
+        done = 0
+        while done < iterations and search.best - search.bound > _MET * search.best:
+            progress("passing messages", done, iterations)
+            search.go_on()
+            done += 1
+        progress("passing messages", iterations, iterations)
+        found = mean_without(_slopes(roadmap, graph, labels, search.chosen), number)
+        smoothness = mean_without(slopes, number)
+        bounds.append(
+            Bound(
+                robot=roadmap.robot.name,
+                task=roadmap.task.kind,
+                vertices=len(vertices),
+                edges=len(slopes),
+                left_out=number,
+                samples=samples,
+                spacing=(float(spacing.median()), float(spacing.max())),
+                iterations=done,
+                smoothness=smoothness,
+                best=min(smoothness, found),
+                bound=bound_without(search.bound, len(slopes), number, truncated),
+                seconds=time.perf_counter() - begin,
+            )
+        )
+        begin = time.perf_counter()
+    return bounds
 
 
-def _check(roadmap: Roadmap, edges: int, samples: int, iterations: int, left_out: int) -> None:
+def bound_without(total: float, edges: int, left_out: int, truncated: float) -> float:
+    """A bound of the mean slope of all edges but any `left_out`, of one of the sum of all slopes, each truncated.
+
+    Of E slopes whose sum, counted up to τ each, is at least B, any E − k sum up to at least B − k τ.
+    """
+    return (total - (left_out * truncated if left_out else 0.0)) / (edges - left_out)
+
+
+def mean_without(slopes: Tensor, left_out: int) -> float:
+    """The mean of slopes (E,) but for the steepest."""
+    return float(slopes.sort().values[: len(slopes) - left_out].mean())
+
+
+def _check(roadmap: Roadmap, edges: int, samples: int, iterations: int, left_out: Sequence[int]) -> None:
     spare = roadmap.robot.n - roadmap.task.constraints
-    if spare > _MOST_SPARE:
-        raise ParameterError("roadmap", f"a task that leaves {spare} degrees of freedom", f"{_MOST_SPARE} or fewer")
+    if not 1 <= spare <= _MOST_SPARE:
+        raise ParameterError("roadmap", f"a task that leaves {spare} degrees of freedom", f"1 to {_MOST_SPARE}")
     if edges == 0:
         raise ParameterError("roadmap", "no edge between resolved vertices", "a roadmap with some")
     if iterations < 1:
         raise ParameterError("iterations", iterations, "1 or more")
-    if not 0 <= left_out < edges:
-        raise ParameterError("left_out", left_out, f"0 to {edges - 1:,}, of {edges:,} edges")
+    for number in left_out:
+        if not 0 <= number < edges:
+            raise ParameterError("left_out", number, f"0 to {edges - 1:,}, of {edges:,} edges")
     free = free_memory(roadmap.robot.device)
     fitting = None if free is None else int((_SHARE * free / (_BYTES * edges)) ** 0.5)
     if samples < 2 or (fitting is not None and samples > fitting):
@@ -187,10 +205,6 @@ def _slopes(roadmap: Roadmap, graph: Graph, labels: Tensor, chosen: Tensor) -> T
     """(E,) D_q / D_p of a choice (V,) of labels (V, L, n)."""
     q = labels[torch.arange(len(chosen), device=chosen.device), chosen]
     return (distance(q[graph.low], q[graph.high], roadmap.robot.continuous) / graph.lengths).double()
-
-
-def _mean_without(slopes: Tensor, left_out: int) -> float:
-    return float(slopes.sort().values[: len(slopes) - left_out].mean())
 
 
 def _tables(roadmap: Roadmap, graph: Graph, labels: Tensor, truncated: float, progress: Progress) -> Tensor:

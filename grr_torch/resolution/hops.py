@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import piece, together
+from grr_torch.pieces import piece
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.spaces.configuration import difference
 
@@ -45,7 +45,7 @@ def hop(network: Network, q: Tensor, tolerances: Tolerances) -> Tensor:
     region = _steep_region(network, q).nonzero()[:, 0]
     if len(region) == 0:
         return q
-    for vertices in region.split(together(_TOGETHER, q.device)):
+    for vertices in region.split(_TOGETHER):
         candidates = _candidates(network, q, vertices, tolerances)
         chosen = _choose(network, q, vertices, candidates)
         own = torch.arange(len(vertices), device=q.device)
@@ -155,6 +155,17 @@ class _Places(NamedTuple):
         """(K, L) sums of values (M, L) by vertex, in one order whatever the device."""
         return torch.segment_reduce(values, "sum", lengths=self.counts, axis=0)
 
+    def parts(self) -> Tensor:
+        """(K,) the first of the vertices that each hangs together with by edges between them."""
+        first = torch.arange(len(self.counts), device=self.rank.device)
+        while True:
+            lower = first.scatter_reduce(0, self.rank[self.inner], first[self.other], "amin")
+            # whom the first of its neighbours follows, it may follow too
+            lower = lower[lower]
+            if torch.equal(lower, first):
+                return first
+            first = lower
+
     def costs(self, labels: Tensor) -> Tensor:
         """(K,) what the edges of each vertex cost, half for those between two of them, with candidates (K,)."""
         costs = self.outer.gather(1, labels[self.rank, None])
@@ -171,9 +182,12 @@ def _tables(network: Network, first: Tensor, second: Tensor, lengths: Tensor) ->
 
 
 def _choose(network: Network, q: Tensor, vertices: Tensor, candidates: Tensor) -> Tensor:
-    """(K,) which of candidates (n, K, L) vertices (K,) take, so that slopes are lowest: the best of all iterations."""
+    """(K,) which of candidates (n, K, L) vertices (K,) take, so that slopes are lowest: the best of all iterations.
+
+    What hangs together by edges between them is judged by itself.
+    """
     places = _Places.of(network, q, vertices, candidates)
-    parts = network.part_of_vertex[vertices]
+    parts = places.parts()
     chosen = torch.zeros_like(vertices)
     least = parts.bincount(places.costs(chosen))
     # what the other ends of edges (M, L) tell of the candidates

@@ -6,6 +6,8 @@ import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import torch
+
 from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError
 from grr_torch.resolution.reachability import reach, reach_box, stays_in_plane, stays_upright, within_reach
 from grr_torch.resolution.seeds import SeedsLike
@@ -169,9 +171,16 @@ def _complete(
         graph = _turned(task, graph, rotations, problem)
     if graph.points.shape[1] != task.width:
         raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.width} for {task.name}")
-    # slopes depend on how fine a grid is
-    of_preset = problem is not None and points is None and bounds is None
-    return Problem(task, graph, seeds, problem.max_slope if problem is not None and of_preset else None)
+    return Problem(task, graph, seeds, _max_slope(graph, problem))
+
+
+def _max_slope(graph: TaskGraph, problem: Preset | None) -> float | None:
+    """The preset's bound of slopes, if the graph is the preset's grid: slopes depend on how fine a grid is."""
+    if problem is None or problem.max_slope is None:
+        return None
+    own = staggered_grid(problem.bounds, problem.points)
+    same = torch.equal(graph.points, own.points) and torch.equal(graph.edges, own.edges)
+    return problem.max_slope if same else None
 
 
 def _grid(

@@ -41,7 +41,7 @@ def refine(
     Unresolved vertices and the ends of broken edges are tried again from all their neighbours and from random starts;
     then all configurations move along their self-motion manifolds at once. No vertex and no connected edge is lost:
     where the relaxed map breaks an edge, its ends go back part of the way, or to where they were. Edges that are broken
-    then are tried once more, in all but large maps. With objectives, the
+    then are tried once more, in all but large maps; what joins them may be steep. With objectives, the
     smoothest map is then relaxed once more, for the sum that `grr_torch.resolution.objectives` gives. At last, edges
     steeper than the roadmap's parameter `max_slope`, if it has one, are left out.
 

@@ -28,8 +28,8 @@ from grr_torch.spaces.configuration import difference, normalise
 from grr_torch.spaces.task import TaskSpace
 
 _ROUNDS = 40
-# times that vertices hop: after the first round, and where rounds would end; where objectives count they do not, for
-# such a map has been relaxed without them
+# times that vertices hop: after the first round, and when all has come to rest before the last; where objectives count
+# they do not, for such a map has been relaxed without them
 _HOPS = 3
 # rounds end when one lowers the cost by less than this share
 _LEAST_GAIN = 2e-5
@@ -106,8 +106,8 @@ class Network:
         edges: (2, E) vertices of each edge.
         lengths: (E,) D_p of each edge.
         objectives: What else counts.
-        parts: (V,) number of the map that a vertex belongs to, if there are several without edges between them: each is
-            then relaxed as if it were alone.
+        parts: (V,) number of the map that a vertex belongs to, if there are several without edges between them: each
+            then has steps, a damping and an end of its own, but all hop together.
     """
 
     robot: Robot

@@ -100,13 +100,15 @@ def repair(
         progress: Told what round it is.
         checkpoint: Where it is kept how far that is; nowhere by default.
         at_last: Whether the map is smooth by now: then configurations beside that of a vertex are tried too, and edges
-            may be of any slope, not only ten times as steep as the median.
+            may be of any slope that the roadmap does not leave out, not only ten times as steep as the median.
     """
     checkpoint = checkpoint or Checkpoint()
     repairing, checking = map(checkpoint.stage, ("repair", "edges-repaired"))
     slopes, max_slope = edge_slopes(roadmap), torch.inf
     if len(slopes):
         max_slope = torch.inf if at_last else STEEP * float(slopes.median())
+    # what is steeper would be left out
+    max_slope = min(max_slope, roadmap.parameters.get("max_slope") or torch.inf)
     generator = torch.Generator().manual_seed(seed)
     means = _Means(roadmap.graph, tolerances, max_slope, _BESIDE if at_last else 0, generator)
     repaired = _repaired(roadmap, means, progress, repairing)
