@@ -80,7 +80,7 @@ def build(
         float | None,
         typer.Option(
             help="Leave out edges whose D_q / D_p is above this, in rad/m, and have info list them; inf: none. "
-            "By default 15.6 for the Kinova's position grid, inf for others."
+            "By default that of the preset's grid, if it has one; otherwise inf."
         ),
     ] = None,
     reachability: Annotated[

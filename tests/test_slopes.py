@@ -25,9 +25,9 @@ BOUNDS = {"planar_5": 12.0, "kinova": 5.0}
 
 @pytest.fixture(scope="module", params=["planar_5", "kinova"])
 def pair(request) -> tuple[grr_torch.Roadmap, grr_torch.Roadmap]:
-    """The same problem without a bound and with one, not refined and refined."""
+    """The same problem without a bound and with one."""
     robot = grr_torch.load_robot(request.param)
-    options = {"points": 400, "refine": request.param == "kinova"}
+    options = {"points": 400, "refine": False}
     return tuple(
         grr_torch.build(robot, "position", **options, max_slope=bound) for bound in (None, BOUNDS[request.param])
     )
@@ -70,10 +70,21 @@ def test_a_file_with_a_bound_is_verified_by_it(pair, tmp_path):
     assert failed == {"edges"}
 
 
-def test_refining_again_keeps_the_bound(pair):
+def test_refining_keeps_the_bound(pair):
+    free, bounded = pair
+    bound = BOUNDS[free.robot.name]
+    refined = refine(bounded)
+    assert refined.quality().smoothness_max <= refined.parameters["max_slope"] == bound
+    assert int(refined.connected.sum()) >= int(bounded.connected.sum())
+    assert bool((edge_slopes(refined, left_out_edges(refined)) > bound).all())
+
+
+def test_a_build_refines_what_the_bound_leaves(pair):
     _, bounded = pair
-    again = refine(bounded)
-    assert again.quality().smoothness_max <= again.parameters["max_slope"] == BOUNDS[bounded.robot.name]
+    robot, bound = bounded.robot, BOUNDS[bounded.robot.name]
+    built, refined = grr_torch.build(robot, "position", points=400, max_slope=bound), refine(bounded)
+    assert torch.equal(built.configurations[built.resolved], refined.configurations[refined.resolved])
+    assert torch.equal(built.connected, refined.connected)
 
 
 @pytest.mark.parametrize("bound", [0.0, -1.0, math.nan, -math.inf])
@@ -86,7 +97,7 @@ def test_the_preset_bounds_its_own_grid_alone(kinova):
     bounds = {
         "of the preset": grr_torch.build(kinova, "position", refine=False),
         "other points": grr_torch.build(kinova, "position", points=400, refine=False),
-        "other task": grr_torch.build(kinova, "fixed-rotation", refine=False),
+        "other task": grr_torch.build(kinova, "yaw", points=200, refine=False),
         "given": grr_torch.build(kinova, "position", refine=False, max_slope=10.0),
         "none": grr_torch.build(kinova, "position", refine=False, max_slope=math.inf),
     }
@@ -107,13 +118,15 @@ def test_random_grr_has_no_bound_of_the_preset(kinova):
 def test_the_preset_bounds_its_grid_however_it_is_given(kinova):
     problem = pose_problem(kinova, "position")
     bound = kinova.preset.problems["position"].max_slope
+    assert bound is not None
     assert pose_problem(kinova, "position", problem.graph).max_slope == bound
     assert pose_problem(kinova, "position", kinova.preset.problems["position"].points).max_slope == bound
     assert pose_problem(kinova, "position", staggered_grid([(0.2, 0.6)] * 3, 50)).max_slope is None
 
 
-@pytest.mark.parametrize(("given", "expected"), [([], 15.6), (["--max-slope", "inf"], None)])
-def test_the_command_takes_the_bound_of_the_preset(run_cli, given, expected):
+@pytest.mark.parametrize(("given", "bounded"), [([], True), (["--max-slope", "inf"], False)])
+def test_the_command_takes_the_bound_of_the_preset(kinova, run_cli, given, bounded):
+    expected = kinova.preset.problems["position"].max_slope if bounded else None
     words = ["build", "--robot", "kinova", "--task", "position", "--no-refine", "--out", "m.grr", "--no-record"]
     code, _, _ = run_cli(*words, *given)
     assert code == 0

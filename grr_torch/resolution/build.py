@@ -80,8 +80,8 @@ def build(
         refine: Whether the roadmap is repaired, relaxed and certified after the expansion.
         objectives: Weights of "clearance", "manipulability" and "limits", which refinement serves besides smoothness;
             at weight 1, 1 % of an objective's mean is worth 1 % of smoothness.
-        max_slope: Edges with D_q / D_p above this [rad/m] are not connected in the end, though continuous: there small
-            moves of the hand are large ones of the arm. inf: no bound. By default that of the preset's grid, if it has
+        max_slope: Edges with D_q / D_p above this [rad/m] are not connected, though continuous: there small moves of
+            the hand are large ones of the arm. inf: no bound. By default that of the preset's grid, if it has
             one and the method is expansion; otherwise none.
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. On the CPU the same inputs give the same tensors.
@@ -144,13 +144,13 @@ def build(
         if crowded := crowding(robot):
             warnings.warn(f"{crowded}: is the sphere model too coarse?", GrrWarning, stacklevel=2)
         parameters = {"method": method, **parts.chosen, **settings}
-        roadmap = _assemble(robot, problem, parts, parameters, kept.seconds("building"))
+        assembled = _assemble(robot, problem, parts, parameters, kept.seconds("building"))
+        # before refinement too: edges that are left out in the end should not pull at the others
+        roadmap = without_steep_edges(assembled)
         if refine:
             roadmap = refine_roadmap(
                 roadmap, objectives=objectives, seed=seed, check=check, progress=progress, checkpoint=kept
             )
-        else:
-            roadmap = without_steep_edges(roadmap)
         if reachability:
             roadmap = _with_reachability(roadmap, tolerances, progress, kept)
         if kept.folder is not None:
