@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -24,6 +25,8 @@ _TIMES_ON_GPU = 16
 FEW = 300
 # of fewer numbers, einsum takes longer to begin than to sum
 _FEW_ENTRIES = 300
+# torch's threads, where operators run on one of them; 0 where they run on all
+_threads: ContextVar[int] = ContextVar("threads", default=0)
 
 
 def piece(device: torch.device) -> int:
@@ -78,11 +81,18 @@ def one_thread() -> Iterator[None]:
     At these sizes it takes longer to wake a second thread than to do its half of an operator's work.
     """
     threads = torch.get_num_threads()
+    outside = _threads.set(cores())
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
+        _threads.reset(outside)
+
+
+def cores() -> int:
+    """How many threads torch may use here, those included that `one_thread` leaves idle."""
+    return _threads.get() or torch.get_num_threads()
 
 
 def norms(motion: Array) -> Array:

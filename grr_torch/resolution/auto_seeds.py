@@ -16,6 +16,7 @@ from torch import Tensor
 
 from grr_torch.errors import ParameterError, check_seed
 from grr_torch.pieces import together
+from grr_torch.processes import at_once
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project_columns, tool_points
@@ -110,13 +111,14 @@ def find_seeds(
     progress("choosing seeds", 2, 3)
     if len(graph.points) > _MOST_TRIED:
         return finalists[0]
-    tried: list[Tensor] = []
-    for seeds in finalists:
-        # one after the other: a map and its relaxation are all that is held besides
+
+    def tried(seeds: Tensor) -> tuple[Tensor]:
+        # a map and its relaxation are all that a process holds besides
         expanded = _expansions(robot, task, graph, [seeds], default_neighbours(task), tolerances)
-        tried.append(_relaxed(robot, task, graph, expanded, tolerances, _FINAL_ROUNDS))
+        return (_relaxed(robot, task, graph, expanded, tolerances, _FINAL_ROUNDS),)
+
+    maps = torch.cat([found for (found,) in at_once(tried, finalists, robot.device)])
     progress("choosing seeds", 3, 3)
-    maps = torch.cat(tried)
     slopes = _slopes(robot, task, graph, maps)
     slopes[_broken(robot, task, graph, maps, slopes, tolerances)] = torch.nan
     best = maps[int(_sums(slopes).argmin())]

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.pieces import together
+from grr_torch.processes import at_once
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
@@ -131,15 +132,20 @@ def spreads(
     done = int(state["done"]) if state else 0
     spread[:done] = state["spread"].to(spread) if state else spread[:0]
     pairs = torch.combinations(torch.arange(corners.shape[1], device=q.device))
-    at_once = together(CELLS_AT_ONCE, q.device)
-    for start in range(done, count, at_once):
-        progress("measuring cells", start, count)
-        part = corners[start : start + at_once].to(q.device)
+    batches = corners[done:].split(together(CELLS_AT_ONCE, q.device))
+
+    def measured(part: Tensor) -> tuple[Tensor]:
+        part = part.to(q.device)
         ends, followed = lead_to_centres(robot, task, points[part], q[part], tolerances)
         apart = distance(ends[:, pairs[:, 0]], ends[:, pairs[:, 1]], robot.continuous).amax(1)
-        end = start + len(part)
-        spread[start:end] = torch.where(followed, apart, torch.inf)
-        kept.keep({"spread": spread[:end], "done": torch.tensor(end)}, last=end == count)
+        return (torch.where(followed, apart, torch.inf),)
+
+    progress("measuring cells", done, count)
+    for (found,) in at_once(measured, batches, q.device):
+        spread[done : done + len(found)] = found
+        done += len(found)
+        kept.keep({"spread": spread[:done], "done": torch.tensor(done)}, last=done == count)
+        progress("measuring cells", done, count)
     progress("measuring cells", count, count)
     return spread
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.pieces import one_thread, together
+from grr_torch.processes import at_once
 from grr_torch.progress import Progress
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.cells import CELLS_AT_ONCE, LARGEST_SPREAD, lead_to_centres, spreads
@@ -152,11 +153,13 @@ def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> T
 def _spread(network: Network, corners: Tensor, q: Tensor, tolerances: Tolerances) -> tuple[Tensor, Tensor, Tensor]:
     """Spread of cells (C,), and of their three pairs of corners: (2, 3C) and what is between their ends (n, 3C)."""
     robot = network.robot
-    parts = [part.to(q.device) for part in corners.split(together(CELLS_AT_ONCE, q.device))]
-    ends, followed = zip(
-        *(lead_to_centres(robot, network.task, network.targets.T[part], q.T[part], tolerances) for part in parts),
-        strict=True,
-    )
+    count = -(-len(corners) // together(CELLS_AT_ONCE, q.device)) or 1
+    parts = [part.to(q.device) for part in corners.chunk(count)]
+
+    def lead(part: Tensor) -> tuple[Tensor, Tensor]:
+        return lead_to_centres(robot, network.task, network.targets.T[part], q.T[part], tolerances)
+
+    ends, followed = zip(*at_once(lead, parts, q.device), strict=True)
     at_centre = torch.cat(ends)
     apart = difference(at_centre, at_centre.roll(-1, dims=1), robot.continuous).transpose(0, 1).reshape(-1, robot.n).T
     pairs = torch.stack([corners.T.flatten(), corners.roll(-1, dims=1).T.flatten()])

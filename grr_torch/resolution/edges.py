@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.pieces import together
+from grr_torch.processes import at_once
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
 # edges that are checked together
-EDGES_AT_ONCE = 16384
+EDGES_AT_ONCE = 8192
 
 # `is_continuous`, or what gives the same by other means, and may say by `at_once` how many edges it takes together
 EdgeCheck = Callable[..., Tensor]
@@ -74,16 +75,30 @@ def continuous_edges(
     state = kept.state()
     if state:
         connected = state["connected"].to(robot.device)
-    at_once = getattr(check, "at_once", together(EDGES_AT_ONCE, robot.device))
-    for start in range(int(state["done"]) if state else 0, len(candidates), at_once):
-        progress("checking edges", start, len(candidates))
-        part = candidates[start : start + at_once]
-        if wanted is not None and not bool(wanted[part].any()):
-            continue
+    done = int(state["done"]) if state else 0
+    batches = candidates[done:].split(getattr(check, "at_once", together(EDGES_AT_ONCE, robot.device)))
+    if wanted is not None:
+        batches = tuple(part for part in batches if bool(wanted[part].any()))
+
+    def checked(part: Tensor) -> tuple[Tensor]:
         a, b = edges[part].T
-        ends = points[a], points[b], configurations[a], configurations[b]
-        connected[part] = check(robot, task, *ends, tolerances=tolerances)
-        end = start + len(part)
-        kept.keep({"connected": connected, "done": torch.tensor(end)}, last=end == len(candidates))
+        return (check(robot, task, points[a], points[b], configurations[a], configurations[b], tolerances=tolerances),)
+
+    progress("checking edges", done, len(candidates))
+    # what is not our own need not bear to be called in a copy of the process
+    results = at_once(checked, batches, robot.device) if check is is_continuous else map(checked, batches)
+    for part, (found,) in zip(batches, results, strict=True):
+        connected[part] = found
+        done += len(part)
+        kept.keep({"connected": connected, "done": torch.tensor(done)}, last=done == len(candidates))
+        progress("checking edges", done, len(candidates))
     progress("checking edges", len(candidates), len(candidates))
     return connected if wanted is None else connected & wanted
+
+
+def continuous_pairs(robot: Robot, task: TaskSpace, *ends: Tensor, tolerances: Tolerances) -> Tensor:
+    """`is_continuous` (N,) for as many points (N, width) and configurations (N, n) as there are, in batches."""
+    size = together(EDGES_AT_ONCE, robot.device)
+    batches = list(zip(*(part.split(size) for part in ends), strict=True))
+    results = at_once(lambda batch: (is_continuous(robot, task, *batch, tolerances=tolerances),), batches, robot.device)
+    return torch.cat([found for (found,) in results])

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from grr_torch.pieces import piece
+from grr_torch.processes import at_once
 from grr_torch.projection.project import Tolerances, project_columns
-from grr_torch.spaces.configuration import difference
+from grr_torch.spaces.configuration import embed
 
 if TYPE_CHECKING:
     from grr_torch.resolution.relax import Network
@@ -27,7 +28,7 @@ _STEEP = 1.5
 _TOGETHER = 1024
 # candidates of a vertex, its own configuration among them
 _CANDIDATES = 16
-# how far apart they were where they come from, at least [rad]
+# how far apart they were where they come from, at least, nearly [rad]
 _APART = 0.1
 _ITERATIONS = 12
 # share of a message that is kept of the one before
@@ -45,12 +46,17 @@ def hop(network: Network, q: Tensor, tolerances: Tolerances) -> Tensor:
     region = _steep_region(network, q).nonzero()[:, 0]
     if len(region) == 0:
         return q
-    for vertices in region.split(_TOGETHER):
-        candidates = _candidates(network, q, vertices, tolerances)
-        chosen = _choose(network, q, vertices, candidates)
+    groups = region.split(_TOGETHER)
+
+    def look(vertices: Tensor) -> tuple[Tensor]:
+        return (_candidates(network, q, vertices, tolerances),)
+
+    hopped = q.clone()
+    for vertices, (candidates,) in zip(groups, at_once(look, groups, q.device), strict=True):
+        chosen = _choose(network, hopped, vertices, candidates)
         own = torch.arange(len(vertices), device=q.device)
-        q = q.index_copy(1, vertices, candidates[:, own, chosen])
-    return q
+        hopped[:, vertices] = candidates[:, own, chosen]
+    return hopped
 
 
 def _steep_region(network: Network, q: Tensor) -> Tensor:
@@ -77,15 +83,19 @@ def _candidates(network: Network, q: Tensor, vertices: Tensor, tolerances: Toler
 def _far_apart(network: Network, q: Tensor, vertices: Tensor) -> Tensor:
     """(K, L - 1) vertices up to two edges away, the one with the most different configuration first; -1 if none."""
     near = _within_two_edges(network, vertices)
-    there, wraps = q[:, near.clamp_min(0)], network.robot.continuous[:, None, None]
+    # as far apart as by their joints, nearly, as long as they are near; and that is a product of matrices
+    rows = embed(q.T, network.robot.continuous)
+    there, last = rows[near.clamp_min(0)], rows[vertices]
+    sizes = there.square().sum(2)
     own = torch.arange(len(vertices), device=q.device)
     distances = torch.where(near >= 0, torch.inf, -torch.inf).to(q)
-    last, chosen = q[:, vertices], []
+    chosen = []
     for _ in range(_CANDIDATES - 1):
-        distances = torch.minimum(distances, difference(last[:, :, None], there, wraps).square().sum(0).sqrt())
+        squared = torch.baddbmm(sizes[..., None], there, last[..., None], alpha=-2.0)[..., 0]
+        distances = torch.minimum(distances, squared + last.square().sum(1, keepdim=True))
         farthest = distances.argmax(1)
-        chosen.append(torch.where(distances[own, farthest] > _APART, near[own, farthest], -1))
-        last = there[:, own, farthest]
+        chosen.append(torch.where(distances[own, farthest] > _APART**2, near[own, farthest], -1))
+        last = there[own, farthest]
     return torch.stack(chosen, dim=1)
 
 

@@ -15,11 +15,11 @@ from torch import Tensor
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
-from grr_torch.resolution.edges import EDGES_AT_ONCE, EdgeCheck, check_edges, continuous_edges
+from grr_torch.resolution.edges import EdgeCheck, check_edges, continuous_edges
 from grr_torch.resolution.roadmap import Roadmap
 
 # edges of maps that are checked whole again
-_MOST_CHECKED = 4 * EDGES_AT_ONCE
+_MOST_CHECKED = 65536
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,8 @@ def without_losses(
 
     The ends of such edges are sent back, as far as they are not where they were. If they are, the edge fails because
     others are checked beside it that were not: then what has changed nearest to it is sent back. Nothing is lost at the
-    latest when all is as it was. In large maps what has moved is checked among few others only.
+    latest when all is as it was. In large maps what has moved is checked among few others only, and what has not is
+    what it was.
 
     Args:
         before: The roadmap as it was; what it wrongly calls connected may be lost.
@@ -88,13 +89,13 @@ def without_losses(
         lost = claimed & ~connected
         rooted = lost & ~changed[edges].any(1)
         doubtful = rooted & ~settled
-        if bool(doubtful.any()):
+        if bool(doubtful.any()) and not is_large(after):
             # they were called connected and are not, or come out otherwise beside other edges: it is the batches in
             # which all edges of what was are checked that tell
             claimed[doubtful] = check_edges(before, flags.tolerances, wanted=doubtful)[doubtful]
             settled |= doubtful
             continue
-        if not whole:
+        if not whole or is_large(after):
             # among few others, nothing is learned of what has not moved
             connected, lost = connected | rooted, lost & ~rooted
         back = _to_send_back(edges, lost, changed)

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from grr_torch.errors import ParameterError
+from grr_torch.pieces import cores
 from grr_torch.projection.project import DEFAULT_TOLERANCES
 from grr_torch.resolution.problem import Problem
 from grr_torch.resolution.reachability import from_random_starts, within_reach
@@ -21,7 +22,7 @@ _RESOLVED = {False: 150, True: 280}
 _CONNECTED = {False: 20, True: 40}
 # what a fit of the measured peaks leaves over
 _MARGIN = 1.2
-# whatever the size: pieces that are worked on
+# whatever the size: pieces that are worked on, in each of the processes that do
 _LEAST = 64 << 20
 # and on a GPU, of an edge, as long as the pieces are not full: these are larger there. Fitted to 3,000 to 1,000,000
 # vertices on one
@@ -52,9 +53,10 @@ def _require(robot: Robot, problem: Problem, refine: bool, free: int | None, pie
         return
     vertices = len(problem.graph.points)
     # pieces that are not full grow with the edges, full ones do not
-    growing = wanted - pieces - _LEAST
+    least = _LEAST * cores()
+    growing = wanted - pieces - least
     of_edges = _EDGE_ON_GPU * len(problem.graph.edges) if pieces else 0
-    fitting = int(vertices * max((free - _LEAST - pieces) / growing, max(free - _LEAST, 0) / (growing + of_edges)))
+    fitting = int(vertices * max((free - least - pieces) / growing, max(free - least, 0) / (growing + of_edges)))
     valid = f"about {fitting:,} vertices"
     if refine and estimate_memory(robot, problem, False, share) + pieces <= free:
         valid += ", or no refinement"
@@ -77,7 +79,7 @@ def estimate_memory(robot: Robot, problem: Problem, refine: bool, share: float) 
     connected = share * int(near[graph.edges].all(1).sum())
     of_graph = _VERTEX * len(graph.points) + _EDGE * len(graph.edges)
     of_map = robot.n * (_RESOLVED[refine] * resolved + _CONNECTED[refine] * connected)
-    return int(_LEAST + _MARGIN * (of_graph + of_map))
+    return int(_LEAST * cores() + _MARGIN * (of_graph + of_map))
 
 
 def free_memory(device: torch.device) -> int | None:

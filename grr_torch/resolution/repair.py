@@ -12,7 +12,7 @@ from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.checkpoint import Checkpoint, Stage
-from grr_torch.resolution.edges import EdgeCheck
+from grr_torch.resolution.edges import EdgeCheck, continuous_pairs
 from grr_torch.resolution.losses import FlagCheck, is_large, moved, without_losses
 from grr_torch.resolution.quality import STEEP, edge_slopes
 from grr_torch.resolution.reachability import within_reach
@@ -219,7 +219,7 @@ def _try(roadmap: Roadmap, candidates: _Candidates, means: _Means) -> _Trial:
     worth = slopes <= means.max_slope
     joined = torch.zeros_like(worth)
     pairs = (part[worth] for part in (*points, *configurations))
-    joined[worth] = is_continuous(roadmap.robot, task, *pairs, tolerances=means.tolerances).cpu()
+    joined[worth] = continuous_pairs(roadmap.robot, task, *pairs, tolerances=means.tolerances).cpu()
     return _Trial(rank, means.graph.edge_between(vertices, ends), slopes, joined)
 
 

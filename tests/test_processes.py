@@ -1,0 +1,173 @@
+"""Batches on all cores: the same whatever their number, and nothing is lost or left behind."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+import grr_torch
+from grr_torch.pieces import cores, one_thread
+from grr_torch.processes import at_once
+
+CPU = torch.device("cpu")
+forks = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+
+
+@pytest.fixture
+def threads():
+    """Sets torch's threads, and sets them back."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def _process(_):
+    return (torch.tensor(os.getpid()),)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+@pytest.mark.parametrize("items", [0, 1, 2, 5])
+def test_results_come_in_order(threads, count, items):
+    threads(count)
+    found = list(at_once(lambda k: (torch.full((k, 2), float(k)), torch.arange(k) > 1), range(items), CPU))
+    assert len(found) == items
+    for k, (values, flags) in enumerate(found):
+        assert torch.equal(values, torch.full((k, 2), float(k)))
+        assert torch.equal(flags, torch.arange(k) > 1)
+
+
+@forks
+def test_there_is_a_process_for_each_of_the_threads_or_items(threads):
+    for count, items, expected in ((1, 5, {os.getpid()}), (2, 5, 2), (3, 2, 2), (2, 1, {os.getpid()})):
+        threads(count)
+        found = {int(number) for (number,) in at_once(_process, range(items), CPU)}
+        assert found == expected if isinstance(expected, set) else len(found - {os.getpid()}) == expected
+
+
+@forks
+def test_operators_on_one_thread_leave_the_others_to_processes(threads):
+    threads(2)
+    with one_thread(), one_thread():
+        assert torch.get_num_threads() == 1
+        assert cores() == 2
+        assert os.getpid() not in {int(number) for (number,) in at_once(_process, range(4), CPU)}
+    assert cores() == torch.get_num_threads() == 2
+
+
+@forks
+def test_what_a_lost_process_was_to_do_is_done_here(threads):
+    threads(2)
+    here = os.getpid()
+
+    def fatal(k):
+        if k == 2 and os.getpid() != here:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return (torch.tensor([k, os.getpid()]),)
+
+    found = torch.stack([row for (row,) in at_once(fatal, range(7), CPU)])
+    assert found[:, 0].tolist() == list(range(7))
+    # every other item is that of the process that was lost, from the third one on
+    assert (found[:, 1] == here).tolist() == [False, False, True, False, True, False, True]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_error_is_raised_as_it_is(threads, count):
+    threads(count)
+
+    def failing(k):
+        if k == 3:
+            raise grr_torch.errors.ParameterError("k", k, "another")
+        return (torch.tensor(k),)
+
+    results = at_once(failing, range(5), CPU)
+    assert [int(next(results)[0]) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(grr_torch.errors.ParameterError, match="k: got 3"):
+        next(results)
+    assert multiprocessing.active_children() == []
+
+
+@forks
+def test_no_process_is_left_when_results_are_not_waited_for(threads):
+    threads(2)
+
+    def slow(k):
+        if k:
+            time.sleep(600.0)
+        return (torch.tensor(k),)
+
+    results = at_once(slow, range(4), CPU)
+    next(results)
+    assert len(multiprocessing.active_children()) == 2
+    results.close()
+    assert multiprocessing.active_children() == []
+
+
+SCRIPT = """
+import os, sys, time, torch
+from grr_torch.processes import at_once
+torch.set_num_threads(2)
+def slow(k):
+    print(os.getpid(), flush=True)
+    time.sleep(1.0)
+    return (torch.tensor(k),)
+for found in at_once(slow, range(600), torch.device("cpu")):
+    pass
+"""
+
+
+def _is_alive(number):
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@forks
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
+def test_processes_end_with_the_one_that_forked_them(sent):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    children = [int(process.stdout.readline()) for _ in range(2)]
+    assert process.pid not in children
+    if sent == signal.SIGINT:
+        os.killpg(process.pid, sent)  # as a terminal does: all of them get it
+    else:
+        process.kill()
+    told = process.stderr.read()
+    process.wait()
+    # one traceback, of the process that was started, or none
+    assert told.count("KeyboardInterrupt") == (1 if sent == signal.SIGINT else 0)
+    until = time.monotonic() + 60.0
+    while any(map(_is_alive, children)) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert not any(map(_is_alive, children))
+
+
+@pytest.mark.parametrize("seeds", [None, "auto"])
+def test_roadmaps_are_the_same_on_any_number_of_cores(monkeypatch, threads, planar_5, seeds):
+    for module, name in (("edges", "EDGES_AT_ONCE"), ("cells", "CELLS_AT_ONCE"), ("certify", "CELLS_AT_ONCE")):
+        monkeypatch.setattr(f"grr_torch.resolution.{module}.{name}", 97)
+    monkeypatch.setattr("grr_torch.resolution.hops._TOGETHER", 50)
+    found = []
+    for count in (1, 2, 3):
+        threads(count)
+        found.append(grr_torch.build(planar_5, "position", points=300, seeds=seeds))
+    for other in found[1:]:
+        assert torch.equal(other.connected, found[0].connected)
+        assert torch.equal(other.configurations[other.resolved], found[0].configurations[found[0].resolved])
+        assert torch.equal(other.triangles().spread, found[0].triangles().spread)
