@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
 # edges that are checked together
-EDGES_AT_ONCE = 8192
+EDGES_AT_ONCE = 16384
 
 # `is_continuous`, or what gives the same by other means, and may say by `at_once` how many edges it takes together
 EdgeCheck = Callable[..., Tensor]
