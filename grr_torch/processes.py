@@ -11,6 +11,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
 import torch
@@ -42,19 +43,20 @@ def at_once(function: Callable[[Item], Results], items: Sequence[Item], device: 
         yield from map(function, items)
         return
     fork = multiprocessing.get_context("fork")
-    ends = [fork.Pipe(duplex=False) for _ in range(count)]
-    workers = [
-        fork.Process(target=_work, args=(function, items[k::count], writer), daemon=True)
-        for k, (_, writer) in enumerate(ends)
-    ]
+    workers: list[BaseProcess] = []
+    readers: list[Connection] = []
     lost = [False] * count
     try:
-        for worker, (_, writer) in zip(workers, ends, strict=True):
-            worker.start()
+        for k in range(count):
+            reader, writer = fork.Pipe(duplex=False)
+            readers.append(reader)
+            workers.append(fork.Process(target=_work, args=(function, items[k::count], writer, readers), daemon=True))
+            workers[k].start()
+            # the one end that is left is that of the process: where it is lost, so is what would be read
             writer.close()
         for number, item in enumerate(items):
             k = number % count
-            found = None if lost[k] else _receive(ends[k][0])
+            found = None if lost[k] else _receive(readers[k])
             lost[k] = found is None
             yield function(item) if found is None else tuple(map(torch.from_numpy, found))
     finally:
@@ -62,7 +64,7 @@ def at_once(function: Callable[[Item], Results], items: Sequence[Item], device: 
             if worker.pid is not None:
                 worker.kill()
                 worker.join()
-        for reader, _ in ends:
+        for reader in readers:
             reader.close()
 
 
@@ -75,7 +77,9 @@ def _receive(reader: Connection) -> tuple[Array, ...] | None:
     return found
 
 
-def _work(function: Callable[[Item], Results], items: Sequence[Item], writer: Connection) -> None:
+def _work(
+    function: Callable[[Item], Results], items: Sequence[Item], writer: Connection, readers: Sequence[Connection]
+) -> None:
     """What a copy of the process does. It ends without a word: whoever waits for it takes over, and may fail aloud."""
     # interrupts are for the process that was forked, which ends this one
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -84,6 +88,9 @@ def _work(function: Callable[[Item], Results], items: Sequence[Item], writer: Co
     parent = os.getppid()
     code = 1
     try:
+        # copies of what the other process reads from: with them, nobody would know that it is gone
+        for reader in readers:
+            reader.close()
         for item in items:
             with torch.no_grad():
                 writer.send(tuple(part.numpy() for part in function(item)))

@@ -62,19 +62,22 @@ def test_operators_on_one_thread_leave_the_others_to_processes(threads):
 
 
 @forks
-def test_what_a_lost_process_was_to_do_is_done_here(threads):
+@pytest.mark.parametrize("fatal", [0, 1, 2, 3, 6])
+@pytest.mark.parametrize("size", [2, 100_000])
+def test_what_a_lost_process_was_to_do_is_done_here(threads, fatal, size):
     threads(2)
     here = os.getpid()
 
-    def fatal(k):
-        if k == 2 and os.getpid() != here:
+    def work(k):
+        if k == fatal and os.getpid() != here:
             os.kill(os.getpid(), signal.SIGKILL)
-        return (torch.tensor([k, os.getpid()]),)
+        return (torch.tensor([k, os.getpid()]).repeat(size, 1),)
 
-    found = torch.stack([row for (row,) in at_once(fatal, range(7), CPU)])
+    found = torch.stack([rows[0] for (rows,) in at_once(work, range(7), CPU)])
     assert found[:, 0].tolist() == list(range(7))
-    # every other item is that of the process that was lost, from the third one on
-    assert (found[:, 1] == here).tolist() == [False, False, True, False, True, False, True]
+    # every other item is that of the process that was lost, from the fatal one on
+    assert (found[:, 1] == here).tolist() == [k >= fatal and k % 2 == fatal % 2 for k in range(7)]
+    assert multiprocessing.active_children() == []
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -116,7 +119,7 @@ torch.set_num_threads(2)
 def slow(k):
     print(os.getpid(), flush=True)
     time.sleep(1.0)
-    return (torch.tensor(k),)
+    return (torch.zeros(100_000),)
 for found in at_once(slow, range(600), torch.device("cpu")):
     pass
 """
