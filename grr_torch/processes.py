@@ -6,9 +6,12 @@ does one thing at a time. So the process forks, as torch's own `DataLoader` does
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
+import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -22,81 +25,117 @@ from grr_torch.pieces import Array, cores
 Item = TypeVar("Item")
 Results = tuple[Tensor, ...]
 
+# two threads that fork at once would give their processes ends of each other's pipes
+_forking = threading.Lock()
+
 
 def at_once(function: Callable[[Item], Results], items: Sequence[Item], device: torch.device) -> Iterator[Results]:
     """Applies a function to items; on the CPU, to as many at a time as torch has threads, each in a process of its own.
 
-    What comes out is the same however many there are. What a process that is lost was to do is done in this one.
+    What comes out is the same however many there are. What a process that is lost, or was never there, was to do is
+    done in this one.
 
     Args:
-        function: Takes an item and gives tensors; what else it changes is lost.
+        function: Takes an item and gives tensors without gradients; what it changes, draws or warns of may be lost.
         items: What it is applied to.
         device: Where it works.
 
     Yields:
         What the function gives, in the order of the items.
     """
-    count = min(cores(), len(items))
-    # copies of a process cannot use its GPU; and what is itself of a pool may have none
-    alone = count < 2 or device.type != "cpu" or multiprocessing.current_process().daemon
-    if alone or "fork" not in multiprocessing.get_all_start_methods():
-        yield from map(function, items)
+    count = min(cores(), len(items)) if device.type == "cpu" and _may_fork() else 1
+    if count < 2:
+        yield from map(torch.no_grad()(function), items)
         return
-    fork = multiprocessing.get_context("fork")
-    workers: list[BaseProcess] = []
-    readers: list[Connection] = []
-    lost = [False] * count
+    workers: list[tuple[BaseProcess, Connection] | None] = []
     try:
         for k in range(count):
-            reader, writer = fork.Pipe(duplex=False)
-            readers.append(reader)
-            workers.append(fork.Process(target=_work, args=(function, items[k::count], writer, readers), daemon=True))
-            workers[k].start()
-            # the one end that is left is that of the process: where it is lost, so is what would be read
-            writer.close()
+            workers.append(_fork(function, items[k::count]))
         for number, item in enumerate(items):
             k = number % count
-            found = None if lost[k] else _receive(readers[k])
-            lost[k] = found is None
-            yield function(item) if found is None else tuple(map(torch.from_numpy, found))
+            found = _receive(workers[k])
+            if found is None:
+                _end([workers[k]])
+                workers[k] = None
+                with torch.no_grad():
+                    yield function(item)
+            else:
+                yield tuple(map(torch.from_numpy, found))
     finally:
-        for worker in workers:
-            if worker.pid is not None:
-                worker.kill()
-                worker.join()
-        for reader in readers:
+        _end(workers)
+
+
+def _may_fork() -> bool:
+    """Not where there is no fork, in a process that is itself of a pool, or beside the threads of Ray."""
+    ray = sys.modules.get("ray")
+    return (
+        "fork" in multiprocessing.get_all_start_methods()
+        and not multiprocessing.current_process().daemon
+        and not (ray is not None and ray.is_initialized())
+    )
+
+
+def _fork(function: Callable[[Item], Results], items: Sequence[Item]) -> tuple[BaseProcess, Connection] | None:
+    """A copy of the process at work on items, and where its results can be read; None if the system has no more."""
+    fork = multiprocessing.get_context("fork")
+    with _forking:
+        try:
+            reader, writer = fork.Pipe(duplex=False)
+        except OSError:
+            return None
+        worker = fork.Process(target=_work, args=(function, items, writer), daemon=True)
+        # interrupts are for this process, which ends the other one
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            worker.start()
+        except OSError:
             reader.close()
+            return None
+        finally:
+            # the one end that is left is that of the process: where it is lost, so is what would be read
+            writer.close()
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return worker, reader
 
 
-def _receive(reader: Connection) -> tuple[Array, ...] | None:
+def _receive(worker: tuple[BaseProcess, Connection] | None) -> tuple[Array, ...] | None:
     """The next results of a process; None if it is lost."""
+    if worker is None:
+        return None
     try:
-        found: tuple[Array, ...] = reader.recv()
+        found: tuple[Array, ...] = worker[1].recv()
     except (EOFError, OSError):
         return None
     return found
 
 
-def _work(
-    function: Callable[[Item], Results], items: Sequence[Item], writer: Connection, readers: Sequence[Connection]
-) -> None:
+def _end(workers: Sequence[tuple[BaseProcess, Connection] | None]) -> None:
+    """Ends processes, whatever they are at."""
+    known = [worker for worker in workers if worker is not None]
+    for process, _ in known:
+        process.kill()
+    for process, reader in known:
+        process.join()
+        reader.close()
+
+
+def _work(function: Callable[[Item], Results], items: Sequence[Item], writer: Connection) -> None:
     """What a copy of the process does. It ends without a word: whoever waits for it takes over, and may fail aloud."""
-    # interrupts are for the process that was forked, which ends this one
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # the threads that torch had are not there any more
-    torch.set_num_threads(1)
-    parent = os.getppid()
     code = 1
-    try:
-        # copies of what the other process reads from: with them, nobody would know that it is gone
-        for reader in readers:
-            reader.close()
-        for item in items:
-            with torch.no_grad():
+    with contextlib.suppress(BaseException):
+        parent = os.getppid()
+        # what the other process has open is its own: locks and pipes that outlived it would keep others out
+        for number in map(int, os.listdir("/dev/fd")):
+            if number > 2 and number != writer.fileno():
+                with contextlib.suppress(OSError):  # the one that listed them
+                    os.close(number)
+        # the threads that torch had are not there any more
+        torch.set_num_threads(1)
+        with torch.no_grad():
+            for item in items:
                 writer.send(tuple(part.numpy() for part in function(item)))
-            if os.getppid() != parent:
-                break
+                if os.getppid() != parent:
+                    break
         code = 0
-    finally:
-        # nothing of what the other process has open is to be closed or flushed here
-        os._exit(code)
+    # nothing of what was copied is to be flushed twice
+    os._exit(code)

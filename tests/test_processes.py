@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import fcntl
 import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 import torch
 
 import grr_torch
+from grr_torch import processes
 from grr_torch.pieces import cores, one_thread
 from grr_torch.processes import at_once
 
@@ -113,52 +117,100 @@ def test_no_process_is_left_when_results_are_not_waited_for(threads):
 
 
 SCRIPT = """
-import os, sys, time, torch
+import fcntl, os, sys, time, torch
 from grr_torch.processes import at_once
 torch.set_num_threads(2)
+lock = open(sys.argv[1], "w")
+fcntl.flock(lock, fcntl.LOCK_EX)
 def slow(k):
-    print(os.getpid(), flush=True)
-    time.sleep(1.0)
+    os.write(1, f"{os.getpid()}\\n".encode())  # at once, whatever the other process writes
+    time.sleep(2.0 if k < 2 else 600.0)
     return (torch.zeros(100_000),)
 for found in at_once(slow, range(600), torch.device("cpu")):
-    pass
+    time.sleep(600.0)
 """
 
 
-def _is_alive(number):
+def _runs(number):
     try:
-        os.kill(number, 0)
-    except ProcessLookupError:
+        return Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except OSError:
         return False
-    return True
+
+
+def _is_locked(path):
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 @forks
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc here")
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
-def test_processes_end_with_the_one_that_forked_them(sent):
+def test_processes_end_with_the_one_that_forked_them(sent, tmp_path):
+    lock = tmp_path / "lock"
     process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT],
+        [sys.executable, "-c", SCRIPT, str(lock)],
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stderr=(tmp_path / "told").open("w"),
         text=True,
         start_new_session=True,
     )
     assert process.stdout is not None
-    assert process.stderr is not None
-    children = [int(process.stdout.readline()) for _ in range(2)]
+    children: set[int] = set()
+    while len(children) < 2:
+        children.add(int(process.stdout.readline()))
     assert process.pid not in children
+    assert _is_locked(lock)
     if sent == signal.SIGINT:
         os.killpg(process.pid, sent)  # as a terminal does: all of them get it
     else:
         process.kill()
-    told = process.stderr.read()
-    process.wait()
+    process.wait(60)
+    # while they end, they keep nobody out
+    assert not _is_locked(lock)
     # one traceback, of the process that was started, or none
-    assert told.count("KeyboardInterrupt") == (1 if sent == signal.SIGINT else 0)
+    assert (tmp_path / "told").read_text().count("KeyboardInterrupt") == (1 if sent == signal.SIGINT else 0)
     until = time.monotonic() + 60.0
-    while any(map(_is_alive, children)) and time.monotonic() < until:
+    while any(map(_runs, children)) and time.monotonic() < until:
         time.sleep(0.1)
-    assert not any(map(_is_alive, children))
+    assert not any(map(_runs, children))
+
+
+@forks
+@pytest.mark.parametrize("failing", ["os.fork", "os.pipe"])
+def test_what_cannot_be_forked_is_done_here(monkeypatch, threads, failing):
+    threads(3)
+    calls = iter([None, OSError("no more"), None])
+    real = os.fork if failing == "os.fork" else os.pipe
+
+    def sometimes(*args):
+        error = next(calls, None)
+        if error is not None:
+            raise error
+        return real(*args)
+
+    monkeypatch.setattr(failing, sometimes)
+    found = [int(number) for (number,) in at_once(_process, range(6), CPU)]
+    assert os.getpid() in found
+    assert len(set(found)) > 1
+
+
+def _multiples(k):
+    return [int(found) for (found,) in at_once(lambda i: (torch.tensor(i * k),), range(9), CPU)]
+
+
+@forks
+def test_several_threads_may_ask_at_once(threads):
+    threads(2)
+    with ThreadPoolExecutor(3) as pool:
+        found = list(
+            pool.map(lambda k: [int(x) for (x,) in at_once(lambda i: (torch.tensor(i * k),), range(9), CPU)], range(3))
+        )
+    assert found == [[i * k for i in range(9)] for k in range(3)]
 
 
 @pytest.mark.parametrize("seeds", [None, "auto"])
@@ -166,10 +218,19 @@ def test_roadmaps_are_the_same_on_any_number_of_cores(monkeypatch, threads, plan
     for module, name in (("edges", "EDGES_AT_ONCE"), ("cells", "CELLS_AT_ONCE"), ("certify", "CELLS_AT_ONCE")):
         monkeypatch.setattr(f"grr_torch.resolution.{module}.{name}", 97)
     monkeypatch.setattr("grr_torch.resolution.hops._TOGETHER", 50)
+    forked, real = [], processes._fork
+
+    def fork(function, items):
+        forked.append(len(items))
+        return real(function, items)
+
+    monkeypatch.setattr(processes, "_fork", fork)
     found = []
     for count in (1, 2, 3):
         threads(count)
+        forked.clear()
         found.append(grr_torch.build(planar_5, "position", points=300, seeds=seeds))
+        assert bool(forked) == (count > 1)
     for other in found[1:]:
         assert torch.equal(other.connected, found[0].connected)
         assert torch.equal(other.configurations[other.resolved], found[0].configurations[found[0].resolved])

@@ -132,7 +132,7 @@ def spreads(
     done = int(state["done"]) if state else 0
     spread[:done] = state["spread"].to(spread) if state else spread[:0]
     pairs = torch.combinations(torch.arange(corners.shape[1], device=q.device))
-    batches = corners[done:].split(together(CELLS_AT_ONCE, q.device))
+    batches = corners[done:].split(together(CELLS_AT_ONCE, q.device)) if done < count else ()
 
     def measured(part: Tensor) -> tuple[Tensor]:
         part = part.to(q.device)

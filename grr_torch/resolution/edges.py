@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -76,24 +76,29 @@ def continuous_edges(
     if state:
         connected = state["connected"].to(robot.device)
     done = int(state["done"]) if state else 0
-    batches = candidates[done:].split(getattr(check, "at_once", together(EDGES_AT_ONCE, robot.device)))
+    size = getattr(check, "at_once", together(EDGES_AT_ONCE, robot.device))
+    batches = [candidates[start : start + size] for start in range(done, len(candidates), size)]
     if wanted is not None:
-        batches = tuple(part for part in batches if bool(wanted[part].any()))
+        batches = [part for part in batches if bool(wanted[part].any())]
 
     def checked(part: Tensor) -> tuple[Tensor]:
         a, b = edges[part].T
         return (check(robot, task, points[a], points[b], configurations[a], configurations[b], tolerances=tolerances),)
 
-    progress("checking edges", done, len(candidates))
     # what is not our own need not bear to be called in a copy of the process
-    results = at_once(checked, batches, robot.device) if check is is_continuous else map(checked, batches)
-    for part, (found,) in zip(batches, results, strict=True):
+    run = at_once if check is is_continuous else _one_by_one
+    progress("checking edges", done, len(candidates))
+    for part, (found,) in zip(batches, run(checked, batches, robot.device), strict=True):
         connected[part] = found
-        done += len(part)
+        done = int(torch.searchsorted(candidates, part[-1])) + 1
         kept.keep({"connected": connected, "done": torch.tensor(done)}, last=done == len(candidates))
         progress("checking edges", done, len(candidates))
     progress("checking edges", len(candidates), len(candidates))
     return connected if wanted is None else connected & wanted
+
+
+def _one_by_one(function: Callable[[Tensor], tuple[Tensor]], batches: list[Tensor], _: Any) -> Iterator[tuple[Tensor]]:
+    return map(function, batches)
 
 
 def continuous_pairs(robot: Robot, task: TaskSpace, *ends: Tensor, tolerances: Tolerances) -> Tensor:

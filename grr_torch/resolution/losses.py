@@ -16,6 +16,7 @@ from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.edges import EdgeCheck, check_edges, continuous_edges
+from grr_torch.resolution.quality import within_bound
 from grr_torch.resolution.roadmap import Roadmap
 
 # edges of maps that are checked whole again
@@ -48,7 +49,8 @@ class FlagCheck:
 
     def _continuous(self, roadmap: Roadmap, edges: Tensor, progress: Progress, kept: Stage) -> Tensor:
         parts = roadmap.points, roadmap.configurations, roadmap.resolved, edges
-        return continuous_edges(roadmap.robot, roadmap.task, *parts, self.tolerances, progress, kept, self.check).cpu()
+        found = continuous_edges(roadmap.robot, roadmap.task, *parts, self.tolerances, progress, kept, self.check).cpu()
+        return found & within_bound(roadmap, edges)
 
 
 def is_large(roadmap: Roadmap) -> bool:
@@ -73,7 +75,7 @@ def without_losses(
     what it was.
 
     Args:
-        before: The roadmap as it was; what it wrongly calls connected may be lost.
+        before: The roadmap as it was; what it wrongly calls connected may be lost, if it is not large.
         after: The same with other configurations, or more vertices resolved.
         send_back: Gives, of a changed roadmap, one in which some vertices (K,) are nearer to what they were.
         flags: How edges are checked.
@@ -92,7 +94,8 @@ def without_losses(
         if bool(doubtful.any()) and not is_large(after):
             # they were called connected and are not, or come out otherwise beside other edges: it is the batches in
             # which all edges of what was are checked that tell
-            claimed[doubtful] = check_edges(before, flags.tolerances, wanted=doubtful)[doubtful]
+            again = check_edges(before, flags.tolerances, wanted=doubtful) & within_bound(before, edges)
+            claimed[doubtful] = again[doubtful]
             settled |= doubtful
             continue
         if not whole or is_large(after):

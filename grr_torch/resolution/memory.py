@@ -11,6 +11,7 @@ import torch
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import cores
 from grr_torch.projection.project import DEFAULT_TOLERANCES
+from grr_torch.resolution.edges import EDGES_AT_ONCE
 from grr_torch.resolution.problem import Problem
 from grr_torch.resolution.reachability import from_random_starts, within_reach
 from grr_torch.robots.robot import Robot
@@ -53,7 +54,7 @@ def _require(robot: Robot, problem: Problem, refine: bool, free: int | None, pie
         return
     vertices = len(problem.graph.points)
     # pieces that are not full grow with the edges, full ones do not
-    least = _LEAST * cores()
+    least = _least(robot, problem)
     growing = wanted - pieces - least
     of_edges = _EDGE_ON_GPU * len(problem.graph.edges) if pieces else 0
     fitting = int(vertices * max((free - least - pieces) / growing, max(free - least, 0) / (growing + of_edges)))
@@ -79,7 +80,13 @@ def estimate_memory(robot: Robot, problem: Problem, refine: bool, share: float) 
     connected = share * int(near[graph.edges].all(1).sum())
     of_graph = _VERTEX * len(graph.points) + _EDGE * len(graph.edges)
     of_map = robot.n * (_RESOLVED[refine] * resolved + _CONNECTED[refine] * connected)
-    return int(_LEAST * cores() + _MARGIN * (of_graph + of_map))
+    return int(_least(robot, problem) + _MARGIN * (of_graph + of_map))
+
+
+def _least(robot: Robot, problem: Problem) -> int:
+    """Bytes of the pieces that are worked on; on the CPU, in as many processes as there are batches of edges."""
+    batches = -(-len(problem.graph.edges) // EDGES_AT_ONCE)
+    return _LEAST * max(1, min(cores(), batches) if robot.device.type == "cpu" else 1)
 
 
 def free_memory(device: torch.device) -> int | None:

@@ -185,7 +185,19 @@ def edge_slopes(roadmap: Roadmap, edges: Tensor | None = None) -> Tensor:
 
     Where D_q and D_p are distances of joint and of task space (Section IV-B of the paper).
     """
-    first, second = roadmap.edges[roadmap.connected if edges is None else edges].T
+    return _slopes(roadmap, roadmap.edges[roadmap.connected if edges is None else edges])
+
+
+def within_bound(roadmap: Roadmap, edges: Tensor) -> Tensor:
+    """(E,) edges (E, 2) that are not steeper than the roadmap's parameter `max_slope`; all, if it has none."""
+    limit = roadmap.parameters.get("max_slope")
+    if limit is None:
+        return torch.ones(len(edges), dtype=torch.bool)
+    return _slopes(roadmap, edges) <= limit
+
+
+def _slopes(roadmap: Roadmap, edges: Tensor) -> Tensor:
+    first, second = edges.T
     q, points = roadmap.configurations, roadmap.points
     moved = distance(q[first], q[second], roadmap.robot.continuous.cpu())
     return moved / roadmap.task.distance(points[first], points[second])
