@@ -66,10 +66,10 @@ def at_once(function: Callable[[Item], Results], items: Sequence[Item], device: 
 
 
 def _may_fork() -> bool:
-    """Not where there is no fork, in a process that is itself of a pool, or beside the threads of Ray."""
+    """Not where a fork is not safe for torch, in a process that is itself of a pool, or beside the threads of Ray."""
     ray = sys.modules.get("ray")
     return (
-        "fork" in multiprocessing.get_all_start_methods()
+        sys.platform == "linux"
         and not multiprocessing.current_process().daemon
         and not (ray is not None and ray.is_initialized())
     )

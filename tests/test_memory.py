@@ -54,6 +54,16 @@ def test_larger_pieces_count_too(kinova):
         assert 0.5 * free < taken < 1.3 * free
 
 
+def test_processes_need_memory_as_far_as_they_have_something_to_do(kinova, planar_5, monkeypatch):
+    small, large = pose_problem(planar_5, "position", 300), pose_problem(kinova, "position", 100_000)
+    taken = {}
+    for count in (1, 2, 64):
+        monkeypatch.setattr(memory, "cores", lambda count=count: count)
+        taken[count] = estimate_memory(planar_5, small, True, 1.0), estimate_memory(kinova, large, True, 1.0)
+    assert taken[1][0] == taken[2][0] == taken[64][0]
+    assert taken[1][1] < taken[2][1] < taken[64][1] < taken[1][1] + 64 * memory._LEAST
+
+
 def test_where_nothing_is_known_nothing_is_refused(planar_5, monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: None)
     assert len(grr_torch.build(planar_5, "position", points=50, refine=False).points) >= 50

@@ -11,6 +11,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -21,7 +22,7 @@ from grr_torch.pieces import cores, one_thread
 from grr_torch.processes import at_once
 
 CPU = torch.device("cpu")
-forks = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+forks = pytest.mark.skipif(sys.platform != "linux", reason="no fork that torch bears")
 
 
 @pytest.fixture
@@ -148,7 +149,6 @@ def _is_locked(path):
 
 
 @forks
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc here")
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL])
 def test_processes_end_with_the_one_that_forked_them(sent, tmp_path):
     lock = tmp_path / "lock"
@@ -204,6 +204,20 @@ def _multiples(k):
 
 
 @forks
+def test_no_process_is_forked_in_one_of_a_pool_or_beside_ray(monkeypatch, threads):
+    threads(2)
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        inside, found = pool.apply(_asked_in_a_pool)
+    assert found == {inside}
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(is_initialized=lambda: True))
+    assert {int(number) for (number,) in at_once(_process, range(4), CPU)} == {os.getpid()}
+
+
+def _asked_in_a_pool():
+    return os.getpid(), {int(number) for (number,) in at_once(_process, range(4), CPU)}
+
+
+@forks
 def test_several_threads_may_ask_at_once(threads):
     threads(2)
     with ThreadPoolExecutor(3) as pool:
@@ -230,7 +244,7 @@ def test_roadmaps_are_the_same_on_any_number_of_cores(monkeypatch, threads, plan
         threads(count)
         forked.clear()
         found.append(grr_torch.build(planar_5, "position", points=300, seeds=seeds))
-        assert bool(forked) == (count > 1)
+        assert bool(forked) == (count > 1 and sys.platform == "linux")
     for other in found[1:]:
         assert torch.equal(other.connected, found[0].connected)
         assert torch.equal(other.configurations[other.resolved], found[0].configurations[found[0].resolved])

@@ -43,6 +43,20 @@ def test_nothing_is_lost_and_the_map_is_smoother(name, task, points):
     assert summary(plain, before) == ""
 
 
+@pytest.mark.parametrize(("name", "task", "points"), PROBLEMS)
+def test_nothing_is_lost_of_a_large_map_either(monkeypatch, name, task, points):
+    plain = grr_torch.build(grr_torch.load_robot(name), task, points=points, refine=False)
+    monkeypatch.setattr("grr_torch.resolution.losses._MOST_CHECKED", 100)
+    # what cannot be told is as it was, as long as its ends are where they were
+    broken = plain.connected.clone()
+    broken[plain.connected.nonzero()[::50, 0]] = False
+    refined = refine(replace(plain, connected=broken))
+    assert bool((refined.connected | ~broken).all())
+    assert refined.quality().smoothness < replace(plain, connected=broken).quality().smoothness
+    checked = check_edges(refined, Tolerances())
+    assert int((checked != refined.connected).sum()) <= 0.005 * int(checked.sum())
+
+
 def test_refining_again_changes_little(planar_5):
     once = grr_torch.build(planar_5, "position", points=400)
     twice = refine(once)
