@@ -57,8 +57,7 @@ def at_once(function: Callable[[Item], Results], items: Sequence[Item], device: 
             if found is None:
                 _end([workers[k]])
                 workers[k] = None
-                with torch.no_grad():
-                    yield function(item)
+                yield torch.no_grad()(function)(item)
             else:
                 yield tuple(map(torch.from_numpy, found))
     finally:

@@ -102,6 +102,22 @@ def test_an_error_is_raised_as_it_is(threads, count):
 
 
 @forks
+def test_gradients_are_asked_for_as_before(threads):
+    for count in (1, 2):
+        threads(count)
+        for fatal in (None, 1):
+
+            def work(k, fatal=fatal, here=os.getpid()):
+                if k == fatal and os.getpid() != here:
+                    os._exit(1)
+                return (torch.tensor(torch.is_grad_enabled()),)
+
+            for (enabled,) in at_once(work, range(4), CPU):
+                assert not bool(enabled)
+                assert torch.is_grad_enabled()
+
+
+@forks
 def test_no_process_is_left_when_results_are_not_waited_for(threads):
     threads(2)
 
