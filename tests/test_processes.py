@@ -103,12 +103,13 @@ def test_an_error_is_raised_as_it_is(threads, count):
 
 @forks
 def test_gradients_are_asked_for_as_before(threads):
+    parent = os.getpid()
     for count in (1, 2):
         threads(count)
         for fatal in (None, 1):
 
-            def work(k, fatal=fatal, here=os.getpid()):
-                if k == fatal and os.getpid() != here:
+            def work(k, fatal=fatal):
+                if k == fatal and os.getpid() != parent:
                     os._exit(1)
                 return (torch.tensor(torch.is_grad_enabled()),)
 
