@@ -107,7 +107,13 @@ def test_the_preset_bounds_its_own_grid_alone(kinova):
     assert found == {"of the preset": preset, "other points": None, "other task": None, "given": 10.0, "none": None}
     whole, left = bounds["none"], bounds["of the preset"]
     assert torch.equal(left.connected, whole.connected.index_fill(0, steep_edges(whole, preset), False))
-    assert int(left.connected.sum()) >= 0.998 * len(left.edges[left.resolved[left.edges].all(1)])
+
+
+@pytest.mark.parametrize("task", ["position", "fixed-rotation"])
+def test_of_the_preset_s_grids_nearly_all_edges_are_left_and_lie_within_the_bound(kinova, task):
+    roadmap = grr_torch.build(kinova, task)
+    assert int(roadmap.connected.sum()) >= 0.995 * int(roadmap.resolved[roadmap.edges].all(1).sum())
+    assert roadmap.quality().smoothness_max <= kinova.preset.problems[task].max_slope
 
 
 def test_random_grr_has_no_bound_of_the_preset(kinova):

@@ -182,7 +182,7 @@ def test_arms_go_round_what_cannot_be_followed(planar_pose):
     goals = spoilt.points[end]
     fractions = torch.linspace(0.0, 1.0, 100, dtype=torch.float64)[:, None, None]
     way = spoilt.task.interpolate(spoilt.points[start], goals, fractions)
-    targets = torch.cat([way, goals.expand(500, -1, -1)])
+    targets = torch.cat([way, goals.expand(1000, -1, -1)])
     q, _ = follow_targets(Teleoperator(spoilt, max_step=0.1), targets)
     assert (_gaps(spoilt, q[-1], goals) < 1e-3).all()
 
