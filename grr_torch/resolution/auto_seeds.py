@@ -15,13 +15,11 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError, check_seed
-from grr_torch.pieces import together
 from grr_torch.processes import at_once
 from grr_torch.progress import Progress, silent
-from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project_columns, tool_points
 from grr_torch.resolution.closed_paths import closed_paths
-from grr_torch.resolution.edges import EDGES_AT_ONCE
+from grr_torch.resolution.edges import continuous_pairs
 from grr_torch.resolution.expand import default_neighbours, grow
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.resolution.seeds import in_the_middle
@@ -203,11 +201,10 @@ def _broken(
     """(C, E) edges of maps (C, V, n), with slopes (C, E), that are steep and not continuous."""
     broken = slopes > _SUSPECT * slopes.nanmedian(dim=1, keepdim=True).values
     points = graph.points.to(maps)
-    for part in broken.nonzero().split(together(EDGES_AT_ONCE, maps.device)):
-        which, edges = part.unbind(1)
-        first, second = graph.edges.to(maps.device)[edges].unbind(1)
-        ends = points[first], points[second], maps[which, first], maps[which, second]
-        broken[which, edges] = ~is_continuous(robot, task, *ends, tolerances=tolerances)
+    which, edges = broken.nonzero().unbind(1)
+    first, second = graph.edges.to(maps.device)[edges].unbind(1)
+    ends = points[first], points[second], maps[which, first], maps[which, second]
+    broken[which, edges] = ~continuous_pairs(robot, task, *ends, tolerances=tolerances)
     return broken
 
 
