@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -205,6 +207,9 @@ def test_after_the_clutch_it_starts_where_the_arm_is(roadmap):
         ({"max_step": torch.ones(3)}, "max_step"),
         ({"acceleration_limits": 0.0}, "acceleration_limits"),
         ({"max_jump": 0.0}, "max_jump"),
+        ({"foresight": -0.1}, "foresight"),
+        ({"foresight": math.nan}, "foresight"),
+        ({"foresight": math.inf}, "foresight"),
         ({"timeout": -1.0}, "timeout"),
         ({"start": torch.zeros(6)}, "shape"),
         ({"start": torch.full((7,), float("nan"))}, "finite"),

@@ -43,6 +43,10 @@ class Arms:
         offsets: (B, n) what the end of the last line differed from its guess by; 0 where it was not to a target.
         offset_at: (B, width) where that line led; NaN where there was none.
         barred: (B, width) the last target that a route led near, without a way on from there; NaN where there is none.
+        given: (B, width) the last target; NaN where there was none.
+        velocity: (B, d) the mean motion of the targets in a step [m].
+        meets: (B, width) where an arm that has fallen behind meets its target; NaN where there is no such place.
+        looks_in: (B,) steps until it is looked for again.
         avoided: Of each arm, the edges that it could not follow since it last went straight.
     """
 
@@ -70,6 +74,10 @@ class Arms:
     offsets: Array
     offset_at: Array
     barred: Array
+    given: Array
+    velocity: Array
+    meets: Array
+    looks_in: Array
     avoided: list[frozenset[tuple[int, int]]]
 
     @staticmethod
@@ -106,6 +114,10 @@ class Arms:
             offsets=np.zeros_like(q),
             offset_at=unknown(width),
             barred=unknown(width),
+            given=unknown(width),
+            velocity=np.zeros((count, follower.task.dimension), q.dtype),
+            meets=unknown(width),
+            looks_in=np.zeros(count, dtype=np.int64),
             avoided=[frozenset()] * count,
         )
         arms.look(follower, np.arange(count))

@@ -1,4 +1,4 @@
-"""Detours over the roadmap: shortest paths of arms to where they cannot go straight."""
+"""Detours over the roadmap: the quickest paths of arms to where they cannot go straight."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Detours:
             arms.last_vertex[which[moved]] = self._last_vertices(goals[moved], goals_q[moved])
 
     def follow(self, arms: Arms, which: Array, briefly: Mask) -> tuple[Array, Mask]:
-        """Steps (A, n) of arms on shortest paths to their last vertices, and which found no way (A,).
+        """Steps (A, n) of arms on the quickest paths to their last vertices, and which found no way (A,).
 
         Arms that have to do it `briefly` (A,), for something else took time, go on to the next vertex; others try to
         leave some out.
@@ -122,7 +122,8 @@ class Detours:
         q, p = arms.q[which[owner]], arms.p[which[owner]]
         placed, points = self._placed[vertex], self._points[vertex]
         lines = self.follower.follow(q, p, placed, points)
-        total = np.where(lines.direct | (lines.safe & on_edge), lengths + self.follower.distance(q, placed), np.inf)
+        steps = lengths + self.follower.duration(self.follower.difference(q, placed))
+        total = np.where(lines.direct | (lines.safe & on_edge), steps, np.inf)
         for row in dict.fromkeys(owner.tolist()):
             mine = (owner == row).nonzero()[0]
             # of equal ways, the one that leads on

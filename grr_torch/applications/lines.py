@@ -32,6 +32,8 @@ _BISECTIONS = 3
 _SAME_GOAL = 0.03
 # of the longest step, so that what the projection adds seldom has to be cut off
 _SLACK = 0.98
+# what the length of a motion counts beside the steps that its slowest joint takes
+_TIE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +176,10 @@ class Follower:
     def share(self, motion: Array) -> Array:
         """(B,) how much of motions (B, n) a step covers, a little less than it could; above 1 of short ones."""
         return _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
+
+    def duration(self, motion: Array) -> Array:
+        """(…,) how many control steps motions (…, n) take; of equal ones, one of less motion in all is less."""
+        return (np.abs(motion) / self._longest).max(-1) + _TIE * norms(motion / self._longest)
 
     def _judge(self, aim: _Aim, found: Array, reached: Mask, after: Array, p: Array, targets: Array) -> Lines:
         """Which of the lines can be followed, by configurations (B, K + 1, n) that were reached (B, K + 1) on them."""

@@ -11,10 +11,11 @@ from grr_torch.applications.arms import Arms
 from grr_torch.applications.detours import Detours
 from grr_torch.applications.hold import much_nearer, nearest_feasible
 from grr_torch.applications.lines import Follower, Lines
+from grr_torch.applications.pursuit import Pursuit
 from grr_torch.applications.rejoin import rejoin
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
-from grr_torch.applications.steps import HOLDING, TRACKING, UNREACHABLE, Steps
+from grr_torch.applications.steps import DETOURING, HOLDING, TRACKING, UNREACHABLE, Steps
 from grr_torch.pieces import Array, Mask, norms
 
 # vertices that are tried as a way back to the map
@@ -51,8 +52,8 @@ class _Round(NamedTuple):
 class Pilot:
     """Decides the next step of arms that are given targets. Works on arrays, as `Follower` does."""
 
-    def __init__(self, follower: Follower, solver: Solver, routes: Routes) -> None:
-        self.follower, self.solver = follower, solver
+    def __init__(self, follower: Follower, solver: Solver, routes: Routes, pursuit: Pursuit) -> None:
+        self.follower, self.solver, self.pursuit = follower, solver, pursuit
         self.detours = Detours(follower, solver, routes)
 
     def steps(self, arms: Arms, which: Array, targets: Array) -> Steps:
@@ -61,6 +62,7 @@ class Pilot:
         Steps that take long take turns with others. On a route, one that looks for a straight way comes after one that
         only follows the route; and points to hold at are searched for in every other step, of all arms at once.
         """
+        asked, targets = targets, self.pursuit.aims(arms, which, targets)
         on_route = (arms.next_vertex[which] >= 0) & arms.on_task[which]
         blind = on_route & (arms.blind[which] > 0) & self.follower.same_goal(targets, arms.aimed[which])
         arms.blind[which[blind]] -= 1
@@ -73,6 +75,8 @@ class Pilot:
         while looks.any() or on_way.any():
             looks = self._lead(round_, self._look(round_, looks), on_way, wanted)
             on_way = np.zeros_like(on_way)
+        ahead = (norms(arms.meets[which]) < np.inf) & ~self.follower.same_goal(arms.p[which], asked)
+        steps.codes[(steps.codes == TRACKING) & ahead] = DETOURING
         return steps
 
     def _search(self, arms: Arms, which: Array, targets: Array, holding: Mask) -> Mask:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
-from grr_torch.spaces.configuration import distance
+from grr_torch.pieces import Array, norms
+from grr_torch.spaces.configuration import difference
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -20,22 +22,25 @@ _GOALS = 256
 
 
 class Routes:
-    """Shortest paths by D_q along connected edges.
+    """Shortest paths along connected edges: by D_q, unless told otherwise.
 
     Attributes:
         part: (V,) the connected part of the roadmap that a vertex lies in.
     """
 
-    def __init__(self, roadmap: Roadmap, open_edges: Tensor | None = None) -> None:
+    def __init__(
+        self, roadmap: Roadmap, open_edges: Tensor | None = None, length: Callable[[Array], Array] = norms
+    ) -> None:
         """Makes the graph.
 
         Args:
             roadmap: The roadmap.
             open_edges: (E,) bool, the edges that routes may take; by default the connected ones.
+            length: Of joint motions (E, n), how long they are (E,).
         """
         first, second = roadmap.edges[roadmap.connected if open_edges is None else open_edges].T
         q = roadmap.configurations
-        lengths = distance(q[first], q[second], roadmap.robot.continuous.cpu()).numpy()
+        lengths = length(difference(q[first], q[second], roadmap.robot.continuous.cpu()).numpy())
         vertices = len(roadmap.points)
         # equal configurations are not the absence of an edge
         lengths = np.maximum(lengths, 1e-9)
@@ -51,7 +56,7 @@ class Routes:
             avoided: Pairs of vertices whose edges no path may take.
 
         Returns:
-            Lengths (V,) [rad], inf where there is no path, and the next vertex (V,) on it, negative at the goal and
+            Lengths (V,), inf where there is no path, and the next vertex (V,) on it, negative at the goal and
             where there is none.
         """
         graph = self._graph

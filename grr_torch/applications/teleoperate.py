@@ -14,6 +14,7 @@ from grr_torch.applications.arms import Arms
 from grr_torch.applications.braking import limit_acceleration
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.pilot import Pilot
+from grr_torch.applications.pursuit import Pursuit
 from grr_torch.applications.retime import per_joint, usual_speeds
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.steps import HOLDING
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 # of projections along lines, whose guesses are near; what takes longer is not to be gone to in a control step
 _ITERATIONS = 6
+# seconds that can be looked ahead
+_FARTHEST_AHEAD = 60.0
 # what a status says, by the codes of steps
 STATUSES = np.array(["tracking", "detouring", "holding", "unreachable"])
 
@@ -37,10 +40,10 @@ class Command:
     Attributes:
         configuration: (*batch, n) configurations for the next control step [rad or m]; continuous joints are not
             wrapped, so that a controller may subtract.
-        status: (*batch,) array of text: "tracking" the target; "detouring", on a planned way to it or back to the
-            map; "holding", because the input was refused, there is no way on, or the arm waits two
-            steps before it sets off on a detour for a target next to it; "unreachable": the target cannot be
-            reached, and the arm goes to the nearest point that can.
+        status: (*batch,) array of text: "tracking" the target; "detouring", on a planned way to it, to where they
+            will meet, or back to the map; "holding", because the input was refused, there is no way on, or the arm
+            waits two steps before it sets off on a detour for a target next to it; "unreachable": the target cannot
+            be reached, and the arm goes to the nearest point that can.
     """
 
     configuration: Tensor
@@ -52,7 +55,8 @@ class Teleoperator:
 
     In every step each arm goes straight to its target's configuration on the map, if the line there is continuous.
     If not, a way over the roadmap is searched for. Where the target cannot be reached, the arm goes to the nearest
-    point that can, and slides along the edge of what is reachable as the target moves.
+    point that can, and slides along the edge of what is reachable as the target moves. If the target is about to come
+    out on the other side of a hole, it goes there in time.
 
     An arm may start anywhere: off the map, outside a limit, in contact. It then goes back by straight joint-space
     motions, and from a contact never deeper into it.
@@ -68,6 +72,7 @@ class Teleoperator:
         acceleration_limits: float | Tensor | None = None,
         max_jump: float = math.inf,
         timeout: float = math.inf,
+        foresight: float = 2.0,
     ) -> None:
         """Makes a teleoperator; nothing moves before `step`.
 
@@ -83,6 +88,8 @@ class Teleoperator:
             max_jump: A target farther from the last one than this [m] is refused, until `reset`; where rotation
                 varies, a radian counts as 0.3 m.
             timeout: An input older than this [s] is refused; see `step`.
+            foresight: For how long a target is taken to go on straight by an arm that cannot follow it, and heads for
+                where they will meet [s]; with 0, it heads for where the target is.
 
         Raises:
             ParameterError: A parameter is out of its range, no vertex is resolved, or the robot is not on the CPU.
@@ -95,6 +102,8 @@ class Teleoperator:
         for name, value in (("max_jump", max_jump), ("timeout", timeout)):
             if not value > 0.0:
                 raise ParameterError(name, value, "above 0")
+        if not 0.0 <= foresight <= _FARTHEST_AHEAD:
+            raise ParameterError("foresight", foresight, f"0 to {_FARTHEST_AHEAD:g} s")
         self.roadmap, self.rate, self.max_jump, self.timeout = roadmap, rate, max_jump, timeout
         longest = (
             usual_speeds(robot.velocity_limits) / rate
@@ -106,7 +115,9 @@ class Teleoperator:
             self._gain = per_joint("acceleration_limits", acceleration_limits, robot.lower) / rate**2
         tolerances = replace(Tolerances(**roadmap.parameters["tolerances"]), iterations=_ITERATIONS)
         self._follower = Follower(robot, roadmap.task, tolerances, longest)
-        self._pilot = Pilot(self._follower, roadmap.solver, Routes(roadmap))
+        routes = Routes(roadmap, length=self._follower.duration)
+        pursuit = Pursuit(self._follower, roadmap.solver, rate, foresight)
+        self._pilot = Pilot(self._follower, roadmap.solver, routes, pursuit)
         self._batch: torch.Size = torch.Size()
         self._arms: Arms | None = None
         self.reset(start)

@@ -1,0 +1,97 @@
+"""Where arms that have fallen behind meet their targets: interception, as long as these go on as they do."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from grr_torch.applications.arms import Arms
+from grr_torch.applications.lines import Follower
+from grr_torch.applications.solve import Solver
+from grr_torch.pieces import Array, Mask, norms
+
+# of the longest edge: what is so near a resolved vertex counts as open. Projections would tell, but take three times as
+# long as a look does without them
+_NEAR = 0.5
+# points at which a target's way ahead is looked at
+_LOOKED = 25
+# an arm looks in every so many-th step
+_EVERY = 4
+# a target's motion is its mean over the last so many seconds
+_MEAN = 0.1
+# one that is faster than this [m/s] has leapt, and one that is slower rests
+_LEAP, _REST = 5.0, 0.05
+# a place to meet is kept until a better one is farther from it than this [m]
+_MOVED = 0.05
+
+
+class Pursuit:
+    """Aims for arms whose targets they cannot follow.
+
+    A target is taken to go on straight, as fast as it has been. An arm whose target has gone into a hole of the map
+    waits as near as it can, and sets off for the other side when it has to in order to be there in time. Once it is on
+    such a way, or on a detour, it heads for the first point at which it can be when the target comes there. From then
+    on it stays a few steps ahead, until the target rests.
+    """
+
+    def __init__(self, follower: Follower, solver: Solver, rate: float, foresight: float) -> None:
+        """For `rate` control steps a second, and targets that are taken to go on so for `foresight` seconds."""
+        self.follower, self.solver, self.rate = follower, solver, rate
+        horizon = int(foresight * rate)
+        self._ahead = np.unique(np.linspace(0, horizon, 1 + min(horizon, _LOOKED)).round())
+        self._fresh = -math.expm1(-1.0 / (_MEAN * rate))
+
+    def aims(self, arms: Arms, which: Array, targets: Array) -> Array:
+        """The points (A, width) that some arms (A,) head for, whose targets are (A, width)."""
+        if len(self._ahead) < 2:
+            return targets
+        self._watch(arms, which, targets)
+        met = norms(arms.meets[which]) < np.inf
+        lost = arms.holds(which) & ~arms.solvable[which]
+        behind = met | (arms.next_vertex[which] >= 0)
+        moves = norms(arms.velocity[which]) > _REST / self.rate
+        arms.meets[which[~moves]] = np.nan
+        due = (behind | lost) & moves
+        arms.looks_in[which] = np.where(due, arms.looks_in[which] - 1, 0)
+        rows = (due & (arms.looks_in[which] <= 0)).nonzero()[0]
+        if len(rows):
+            arms.looks_in[which[rows]] = _EVERY
+            self._look(arms, which[rows], targets[rows], behind[rows])
+        return np.where(norms(arms.meets[which])[:, None] < np.inf, arms.meets[which], targets)
+
+    def _watch(self, arms: Arms, which: Array, targets: Array) -> None:
+        """How targets (A, width) move."""
+        motion = (targets - arms.given[which])[:, : self.follower.task.dimension]
+        steady = norms(motion) <= _LEAP / self.rate  # comparison with NaN, where there was no target yet, is false
+        arms.velocity[which] += self._fresh * (np.where(steady[:, None], motion, 0.0) - arms.velocity[which])
+        arms.velocity[which[~steady]] = 0.0
+        arms.given[which] = targets
+
+    def _look(self, arms: Arms, which: Array, targets: Array, behind: Mask) -> None:
+        """Looks for where arms (A,) meet targets (A, width); those that are not `behind` (A,) may wait."""
+        d, steps = self.follower.task.dimension, self._ahead.astype(targets.dtype)
+        points = targets[:, None].repeat(len(steps), 1)
+        points[..., :d] += steps[:, None] * arms.velocity[which][:, None]
+        open_, needs = self._needs(arms.q[which], points)
+        in_time = needs <= steps
+        first, rows = in_time.argmax(1), np.arange(len(which))
+        # where the way out of the hole is, if the target is in one
+        out = open_.argmax(1)
+        meets = in_time.any(1) & (first > 0) & (behind | (needs[rows, out] >= steps[out]))
+        place = points[rows, first]
+        kept = norms((place - arms.meets[which])[:, :d]) < _MOVED
+        arms.meets[which[meets & ~kept]] = place[meets & ~kept]
+        arms.meets[which[~meets]] = np.nan
+
+    def _needs(self, q: Array, points: Array) -> tuple[Mask, Array]:
+        """Which points (A, K, width) are likely open (A, K), and the steps there (A, K) from configurations (A, n)."""
+        flat = torch.from_numpy(points.reshape(-1, points.shape[2]))
+        guesses, codes = self.solver.guess(flat, certified=False)
+        likely = codes <= 1
+        if self.follower.task.rotations is None:  # else, to look for the nearest vertex takes long
+            likely &= self.solver.nearest(flat)[0][:, 0] <= _NEAR * self.solver.radius
+        open_: Mask = likely.numpy().reshape(points.shape[:2])
+        motion = self.follower.difference(q[:, None], guesses.numpy().reshape(*open_.shape, -1))
+        return open_, np.where(open_, self.follower.duration(np.nan_to_num(motion)), np.inf)

@@ -1,0 +1,117 @@
+"""Arms that have fallen behind meet their targets where these will be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from teleoperated import follow_targets, some_vertices
+
+import grr_torch
+from grr_torch import Teleoperator
+from grr_torch.applications.lines import Follower
+from grr_torch.applications.routes import Routes
+from grr_torch.experiments.paths import draw_paths
+from grr_torch.experiments.teleoperation import starts
+from grr_torch.projection.project import DEFAULT_TOLERANCES
+from grr_torch.spaces.configuration import difference
+
+STEP = 0.04
+
+
+@pytest.fixture(scope="module")
+def roadmap(kinova_roadmap) -> grr_torch.Roadmap:
+    return kinova_roadmap
+
+
+@pytest.fixture(scope="module")
+def through_holes(roadmap) -> torch.Tensor:
+    """Targets (200, 40, 3) on lines through the robot's base."""
+    return draw_paths(roadmap, "line_self", 40, seed=3).transpose(0, 1)
+
+
+def _followed(roadmap, targets, foresight):
+    """Tools (steps, arms, 3) and statuses of arms that follow targets (steps, arms, 3)."""
+    start = starts(roadmap, targets[0])
+    teleoperator = Teleoperator(roadmap, start=start, max_step=STEP, foresight=foresight)
+    q, status = follow_targets(teleoperator, targets)
+    assert float(torch.cat([start[None], q]).diff(dim=0).abs().max()) <= STEP + 1e-12
+    assert not bool(roadmap.robot.in_self_collision(q).any())
+    return roadmap.robot.forward_kinematics(q)[0], status
+
+
+def _behind(tools, targets):
+    return float((tools - targets).norm(dim=2).mean())
+
+
+def test_arms_are_less_behind_targets_that_cross_a_hole(roadmap, through_holes):
+    ahead, status = _followed(roadmap, through_holes, 2.0)
+    without, _ = _followed(roadmap, through_holes, 0.0)
+    assert _behind(ahead, through_holes) < 0.8 * _behind(without, through_holes)
+    # who heads for where it will meet its target does not say that it tracks it
+    far = torch.from_numpy(status == "tracking") & ((ahead - through_holes).norm(dim=2) > 0.3)
+    assert float(far.double().mean()) < 0.02
+
+
+def test_targets_that_rest_in_a_hole_are_approached_as_without_foresight(roadmap, through_holes):
+    middle = through_holes[100].expand(260, -1, -1)
+    targets = torch.cat([through_holes[:100], middle])
+    lefts = []
+    for foresight in (2.0, 0.0):
+        tools, status = _followed(roadmap, targets, foresight)
+        lefts.append((tools[-1] - targets[-1]).norm(dim=1))
+        assert "holding" not in status[-1]
+        assert float((tools[-40:].amax(0) - tools[-40:].amin(0)).max()) < 0.02, "it has come to rest"
+    assert float((lefts[0] - lefts[1]).mean()) < 0.02
+
+
+def test_targets_that_can_be_followed_are_followed_all_the_same(roadmap):
+    targets = draw_paths(roadmap, "circle_random", 20, seed=5).transpose(0, 1)
+    with_, without = (_followed(roadmap, targets, foresight) for foresight in (2.0, 0.0))
+    same = (with_[0] == without[0]).all(0).all(1)
+    assert float(same.double().mean()) >= 0.9, "some may fall behind where the map is steep"
+
+
+def test_a_target_that_leaps_is_not_led(roadmap):
+    """A leap is no motion that goes on: the arm goes where the target is, and comes to rest there."""
+    vertices = some_vertices(roadmap, 40, 8)
+    points = roadmap.points[vertices]
+    targets = torch.cat([points[:20].expand(20, -1, -1), points[20:].expand(500, -1, -1)])
+    tools, status = _followed(roadmap, targets, 2.0)
+    assert float((tools[-1] - targets[-1]).norm(dim=1).max()) < 1e-3
+    assert (status[-1] == "tracking").all()
+
+
+@pytest.mark.parametrize("rate", [25.0, 200.0])
+def test_foresight_is_in_seconds(roadmap, through_holes, rate):
+    """The same motion in fewer or more control steps is led as well."""
+    count = int(200 * rate / 50.0)
+    index = torch.linspace(0, 199, count).round().long()
+    targets = through_holes[index]
+    behind = []
+    for foresight in (2.0, 0.0):
+        arms = Teleoperator(
+            roadmap, rate, start=starts(roadmap, targets[0]), max_step=STEP * 50.0 / rate, foresight=foresight
+        )
+        q, _ = follow_targets(arms, targets)
+        behind.append(_behind(roadmap.robot.forward_kinematics(q)[0], targets))
+    assert behind[0] < 0.85 * behind[1]
+
+
+def test_detours_are_the_quickest_routes(roadmap):
+    longest = torch.linspace(0.02, 0.06, 7, dtype=torch.float64)
+    follower = Follower(roadmap.robot, roadmap.task, DEFAULT_TOLERANCES, longest)
+    quick, short = Routes(roadmap, length=follower.duration), Routes(roadmap)
+    vertices = some_vertices(roadmap, 40, 2).tolist()
+    saved = []
+    for a, b in zip(vertices[:20], vertices[20:], strict=True):
+        steps = []
+        for routes in (quick, short):
+            q = roadmap.configurations[routes.between(a, b)]
+            motion = difference(q[:-1], q[1:], roadmap.robot.continuous).numpy()
+            assert float(np.abs(motion / longest.numpy()).max(1).sum()) <= follower.duration(motion).sum()
+            steps.append(float(follower.duration(motion).sum()))
+        assert steps[0] == pytest.approx(float(quick.towards(b)[0][a]))
+        assert steps[0] <= steps[1] + 1e-9
+        saved.append(steps[1] - steps[0])
+    assert max(saved) > 1.0
