@@ -138,6 +138,10 @@ class Arms:
         """Whether arms (A,) have a point to hold at: (A,)."""
         return norms(self.held[which]) < np.inf
 
+    def meeting(self, which: Array) -> Mask:
+        """Whether arms (A,) head for where they meet their targets: (A,)."""
+        return ~np.isnan(self.meets[which, 0])
+
     def forget(self, which: Array) -> None:
         """Arms (A,) that have no more need of a route or a point to hold at."""
         for nothing in (self.held, self.held_q, self.barred):

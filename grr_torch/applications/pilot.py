@@ -75,8 +75,10 @@ class Pilot:
         while looks.any() or on_way.any():
             looks = self._lead(round_, self._look(round_, looks), on_way, wanted)
             on_way = np.zeros_like(on_way)
-        ahead = (norms(arms.meets[which]) < np.inf) & ~self.follower.same_goal(arms.p[which], asked)
-        steps.codes[(steps.codes == TRACKING) & ahead] = DETOURING
+        ahead = (arms.meeting(which) & (steps.codes == TRACKING)).nonzero()[0]
+        if len(ahead):
+            far = ~self.follower.same_goal(arms.p[which[ahead]], asked[ahead])
+            steps.codes[ahead[far]] = DETOURING
         return steps
 
     def _search(self, arms: Arms, which: Array, targets: Array, holding: Mask) -> Mask:

@@ -48,18 +48,20 @@ class Pursuit:
         if len(self._ahead) < 2:
             return targets
         self._watch(arms, which, targets)
-        met = norms(arms.meets[which]) < np.inf
-        lost = arms.holds(which) & ~arms.solvable[which]
-        behind = met | (arms.next_vertex[which] >= 0)
+        behind = arms.meeting(which) | (arms.next_vertex[which] >= 0)
+        due = behind | arms.holds(which) & ~arms.solvable[which]
+        if not due.any():
+            arms.looks_in[which] = 0
+            return targets
         moves = norms(arms.velocity[which]) > _REST / self.rate
         arms.meets[which[~moves]] = np.nan
-        due = (behind | lost) & moves
+        due &= moves
         arms.looks_in[which] = np.where(due, arms.looks_in[which] - 1, 0)
         rows = (due & (arms.looks_in[which] <= 0)).nonzero()[0]
         if len(rows):
             arms.looks_in[which[rows]] = _EVERY
             self._look(arms, which[rows], targets[rows], behind[rows])
-        return np.where(norms(arms.meets[which])[:, None] < np.inf, arms.meets[which], targets)
+        return np.where(arms.meeting(which)[:, None], arms.meets[which], targets)
 
     def _watch(self, arms: Arms, which: Array, targets: Array) -> None:
         """How targets (A, width) move."""
