@@ -108,7 +108,7 @@ class Detours:
     def _enter(
         self, arms: Arms, which: Array, result: Array, left: Mask, tried: list[tuple[int, int, float, bool]]
     ) -> None:
-        """Sends arms (A,) to that of their vertices from which the way is shortest, if one can be gone to.
+        """Sends arms (A,) to that of their vertices from which the way is quickest, if one can be gone to.
 
         Args:
             arms: All arms.
