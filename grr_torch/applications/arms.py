@@ -43,10 +43,14 @@ class Arms:
         offsets: (B, n) what the end of the last line differed from its guess by; 0 where it was not to a target.
         offset_at: (B, width) where that line led; NaN where there was none.
         barred: (B, width) the last target that a route led near, without a way on from there; NaN where there is none.
-        given: (B, width) the last target; NaN where there was none.
+        given: (B, width) the last target that was accepted; NaN where there was none.
+        unchanged: (B,) steps since it was first given; at least 1.
         velocity: (B, d) the mean motion of the targets in a step [m].
-        meets: (B, width) where an arm that has fallen behind meets its target; NaN where there is no such place.
+        going: (B,) steps for which they have gone straight.
+        meets: (B, width) where an arm that has fallen behind meets its target, which it heads for as for a target; NaN
+            where there is no such place.
         looks_in: (B,) steps until it is looked for again.
+        caught_up: (B,) steps for which the arm has been next to its target.
         avoided: Of each arm, the edges that it could not follow since it last went straight.
     """
 
@@ -75,9 +79,12 @@ class Arms:
     offset_at: Array
     barred: Array
     given: Array
+    unchanged: Array
     velocity: Array
+    going: Array
     meets: Array
     looks_in: Array
+    caught_up: Array
     avoided: list[frozenset[tuple[int, int]]]
 
     @staticmethod
@@ -115,9 +122,12 @@ class Arms:
             offset_at=unknown(width),
             barred=unknown(width),
             given=unknown(width),
+            unchanged=np.zeros(count, dtype=np.int64),
             velocity=np.zeros((count, follower.task.dimension), q.dtype),
+            going=np.zeros(count, dtype=np.int64),
             meets=unknown(width),
             looks_in=np.zeros(count, dtype=np.int64),
+            caught_up=np.zeros(count, dtype=np.int64),
             avoided=[frozenset()] * count,
         )
         arms.look(follower, np.arange(count))

@@ -75,10 +75,10 @@ class Pilot:
         while looks.any() or on_way.any():
             looks = self._lead(round_, self._look(round_, looks), on_way, wanted)
             on_way = np.zeros_like(on_way)
-        ahead = (arms.meeting(which) & (steps.codes == TRACKING)).nonzero()[0]
+        ahead = (arms.meeting(which) & (steps.codes != HOLDING)).nonzero()[0]
         if len(ahead):
-            far = ~self.follower.same_goal(arms.p[which[ahead]], asked[ahead])
-            steps.codes[ahead[far]] = DETOURING
+            near = self.follower.same_goal(arms.p[which[ahead]], asked[ahead])
+            steps.codes[ahead[~near]] = DETOURING
         return steps
 
     def _search(self, arms: Arms, which: Array, targets: Array, holding: Mask) -> Mask:

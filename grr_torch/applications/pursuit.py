@@ -12,36 +12,43 @@ from grr_torch.applications.lines import Follower
 from grr_torch.applications.solve import Solver
 from grr_torch.pieces import Array, Mask, norms
 
+# control steps that are looked ahead at most
+_FARTHEST = 1_000_000
 # of the longest edge: what is so near a resolved vertex counts as open. Projections would tell, but take three times as
 # long as a look does without them
-_NEAR = 0.5
+_OPEN = 0.5
 # points at which a target's way ahead is looked at
 _LOOKED = 25
 # an arm looks in every so many-th step
 _EVERY = 4
-# a target's motion is its mean over the last so many seconds
-_MEAN = 0.1
+# a target's motion is its mean over the last so many seconds, and none if it has not moved for longer than that
+_MEAN, _STALE = 0.1, 0.15
 # one that is faster than this [m/s] has leapt, and one that is slower rests
 _LEAP, _REST = 5.0, 0.05
+# a motion whose cosine with the mean is less has turned
+_STRAIGHT = 0.8
 # a place to meet is kept until a better one is farther from it than this [m]
 _MOVED = 0.05
+# what has gone straight so long is taken to go on for so many times as long
+_AS_LONG = 1.5
+# an arm that is next to its target for so long [s] has caught up: at once, it would fall behind again beside the hole
+_CAUGHT_UP = 1.0
 
 
 class Pursuit:
     """Aims for arms whose targets they cannot follow.
 
-    A target is taken to go on straight, as fast as it has been. An arm whose target has gone into a hole of the map
-    waits as near as it can, and sets off for the other side when it has to in order to be there in time. Once it is on
-    such a way, or on a detour, it heads for the first point at which it can be when the target comes there. From then
-    on it stays a few steps ahead, until the target rests.
+    A target is taken to go on straight, as fast as it has been, for half as long again as it has done so. An arm whose
+    target has gone into a hole of the map waits as near as it can, and sets off for the other side when it has to in
+    order to be there in time. Once it is on such a way, or on a detour, it heads for the first point at which it can be
+    when the target comes there, until it has caught up.
     """
 
     def __init__(self, follower: Follower, solver: Solver, rate: float, foresight: float) -> None:
-        """For `rate` control steps a second, and targets that are taken to go on so for `foresight` seconds."""
+        """For `rate` control steps a second, and targets that are taken to go on so for `foresight` seconds at most."""
         self.follower, self.solver, self.rate = follower, solver, rate
-        horizon = int(foresight * rate)
+        horizon = min(math.ceil(min(foresight * rate, _FARTHEST)), _FARTHEST)
         self._ahead = np.unique(np.linspace(0, horizon, 1 + min(horizon, _LOOKED)).round())
-        self._fresh = -math.expm1(-1.0 / (_MEAN * rate))
 
     def aims(self, arms: Arms, which: Array, targets: Array) -> Array:
         """The points (A, width) that some arms (A,) head for, whose targets are (A, width)."""
@@ -64,12 +71,20 @@ class Pursuit:
         return np.where(arms.meeting(which)[:, None], arms.meets[which], targets)
 
     def _watch(self, arms: Arms, which: Array, targets: Array) -> None:
-        """How targets (A, width) move."""
-        motion = (targets - arms.given[which])[:, : self.follower.task.dimension]
-        steady = norms(motion) <= _LEAP / self.rate  # comparison with NaN, where there was no target yet, is false
-        arms.velocity[which] += self._fresh * (np.where(steady[:, None], motion, 0.0) - arms.velocity[which])
-        arms.velocity[which[~steady]] = 0.0
+        """How targets (A, width) move. They may be given less often than in every step."""
+        d, passed = self.follower.task.dimension, arms.unchanged[which]
+        motion = (targets - arms.given[which])[:, :d] / passed[:, None]
+        length, velocity = norms(motion), arms.velocity[which]
+        steady = length <= _LEAP / self.rate  # comparison with NaN, where there was no target yet, is false
+        moved = ~(length == 0.0)
+        straight = (motion * velocity).sum(1) >= _STRAIGHT * length * norms(velocity)
+        share = -np.expm1(-passed / (_MEAN * self.rate))
+        velocity = np.where((moved & steady)[:, None], velocity + share[:, None] * (motion - velocity), velocity)
+        velocity[moved & ~steady | ~moved & (passed > _STALE * self.rate)] = 0.0
+        arms.velocity[which] = velocity
+        arms.going[which] = np.where(moved & ~(steady & straight), 0, arms.going[which] + 1)
         arms.given[which] = targets
+        arms.unchanged[which[moved]] = 0
 
     def _look(self, arms: Arms, which: Array, targets: Array, behind: Mask) -> None:
         """Looks for where arms (A,) meet targets (A, width); those that are not `behind` (A,) may wait."""
@@ -77,13 +92,16 @@ class Pursuit:
         points = targets[:, None].repeat(len(steps), 1)
         points[..., :d] += steps[:, None] * arms.velocity[which][:, None]
         open_, needs = self._needs(arms.q[which], points)
-        in_time = needs <= steps
+        in_time = (needs <= steps) & (steps <= _AS_LONG * arms.going[which, None])
         first, rows = in_time.argmax(1), np.arange(len(which))
         # where the way out of the hole is, if the target is in one
         out = open_.argmax(1)
-        meets = in_time.any(1) & (first > 0) & (behind | (needs[rows, out] >= steps[out]))
+        near = behind & (needs[:, 0] <= steps[1])
+        arms.caught_up[which] = np.where(near, arms.caught_up[which] + _EVERY, 0)
+        meets = in_time.any(1) & (behind | (needs[rows, out] >= steps[out]))
+        meets &= (first > 0) & (arms.caught_up[which] < _CAUGHT_UP * self.rate)
         place = points[rows, first]
-        kept = norms((place - arms.meets[which])[:, :d]) < _MOVED
+        kept = self.follower.task.gap_of_few(place, arms.meets[which]) < _MOVED
         arms.meets[which[meets & ~kept]] = place[meets & ~kept]
         arms.meets[which[~meets]] = np.nan
 
@@ -93,7 +111,7 @@ class Pursuit:
         guesses, codes = self.solver.guess(flat, certified=False)
         likely = codes <= 1
         if self.follower.task.rotations is None:  # else, to look for the nearest vertex takes long
-            likely &= self.solver.nearest(flat)[0][:, 0] <= _NEAR * self.solver.radius
+            likely &= self.solver.nearest(flat)[0][:, 0] <= _OPEN * self.solver.radius
         open_: Mask = likely.numpy().reshape(points.shape[:2])
         motion = self.follower.difference(q[:, None], guesses.numpy().reshape(*open_.shape, -1))
         return open_, np.where(open_, self.follower.duration(np.nan_to_num(motion)), np.inf)

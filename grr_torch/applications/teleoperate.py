@@ -88,8 +88,8 @@ class Teleoperator:
             max_jump: A target farther from the last one than this [m] is refused, until `reset`; where rotation
                 varies, a radian counts as 0.3 m.
             timeout: An input older than this [s] is refused; see `step`.
-            foresight: For how long a target is taken to go on straight by an arm that cannot follow it, and heads for
-                where they will meet [s]; with 0, it heads for where the target is.
+            foresight: For how long at most a target is taken to go on straight by an arm that cannot follow it, and
+                heads for where they will meet [s]; with 0, it heads for where the target is.
 
         Raises:
             ParameterError: A parameter is out of its range, no vertex is resolved, or the robot is not on the CPU.
@@ -189,6 +189,7 @@ class Teleoperator:
     def _advance(self, accepted: Mask, targets: Array) -> Command:
         arms = self._arms
         assert arms is not None
+        arms.unchanged += 1
         q, goals, points = arms.q.copy(), arms.q.copy(), arms.p.copy()
         codes = np.full(len(targets), HOLDING)
         which = accepted.nonzero()[0]
