@@ -31,6 +31,10 @@ _STRAIGHT = 0.8
 _MOVED = 0.05
 # what has gone straight so long is taken to go on for so many times as long
 _AS_LONG = 1.5
+# what is not so far [s] is come to along the edge of reach
+_FAR = 0.4
+# steps in which an arm that is next to its target can be there
+_NEXT_TO = 2.0
 # an arm that is next to its target for so long [s] has caught up: at once, it would fall behind again beside the hole
 _CAUGHT_UP = 1.0
 
@@ -68,7 +72,17 @@ class Pursuit:
         if len(rows):
             arms.looks_in[which[rows]] = _EVERY
             self._look(arms, which[rows], targets[rows], behind[rows])
-        return np.where(arms.meeting(which)[:, None], arms.meets[which], targets)
+        meeting = arms.meeting(which)
+        # who is next to its target keeps the same little way ahead of it
+        ahead = (meeting & (arms.caught_up[which] > 0)).nonzero()[0]
+        arms.meets[which[ahead]] = self._on_way(targets[ahead], arms.velocity[which[ahead]], np.array([_NEXT_TO]))[:, 0]
+        return np.where(meeting[:, None], arms.meets[which], targets)
+
+    def _on_way(self, targets: Array, velocity: Array, steps: Array) -> Array:
+        """Points (A, K, width) where targets (A, width) are after steps (K,) with a velocity (A, d)."""
+        points = targets[:, None].repeat(len(steps), 1)
+        points[..., : velocity.shape[1]] += steps.astype(targets.dtype)[:, None] * velocity[:, None]
+        return points
 
     def _watch(self, arms: Arms, which: Array, targets: Array) -> None:
         """How targets (A, width) move. They may be given less often than in every step."""
@@ -88,17 +102,15 @@ class Pursuit:
 
     def _look(self, arms: Arms, which: Array, targets: Array, behind: Mask) -> None:
         """Looks for where arms (A,) meet targets (A, width); those that are not `behind` (A,) may wait."""
-        d, steps = self.follower.task.dimension, self._ahead.astype(targets.dtype)
-        points = targets[:, None].repeat(len(steps), 1)
-        points[..., :d] += steps[:, None] * arms.velocity[which][:, None]
+        steps, points = self._ahead, self._on_way(targets, arms.velocity[which], self._ahead)
         open_, needs = self._needs(arms.q[which], points)
         in_time = (needs <= steps) & (steps <= _AS_LONG * arms.going[which, None])
         first, rows = in_time.argmax(1), np.arange(len(which))
         # where the way out of the hole is, if the target is in one
         out = open_.argmax(1)
-        near = behind & (needs[:, 0] <= steps[1])
+        near = behind & (needs[:, 0] <= _NEXT_TO)
         arms.caught_up[which] = np.where(near, arms.caught_up[which] + _EVERY, 0)
-        meets = in_time.any(1) & (behind | (needs[rows, out] >= steps[out]))
+        meets = in_time.any(1) & (behind | (needs[rows, out] >= np.maximum(steps[out], _FAR * self.rate)))
         meets &= (first > 0) & (arms.caught_up[which] < _CAUGHT_UP * self.rate)
         place = points[rows, first]
         kept = self.follower.task.gap_of_few(place, arms.meets[which]) < _MOVED
