@@ -114,6 +114,13 @@ def test_the_motion_of_targets_that_are_given_seldom_is_known(roadmap, every, re
     assert np.abs(found[-1] - motion.numpy()).max() < 0.01 * float(motion.abs().max())
 
 
+def test_a_leap_after_a_rest_is_no_motion(roadmap):
+    """However long it was: how fast a target went there is not known."""
+    rest = torch.full((40, 3, 3), 0.2, dtype=torch.float64)
+    targets = torch.cat([rest, rest[:3] + 0.3])
+    assert not _watched(roadmap, targets, 50.0, [True] * len(targets)).any()
+
+
 @pytest.mark.parametrize("leap", [0.0, 0.2], ids=["rests", "leaps"])
 def test_a_target_that_rests_or_leaps_has_no_motion(roadmap, leap):
     motion = torch.full((3, 3), 2e-3, dtype=torch.float64)

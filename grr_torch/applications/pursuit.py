@@ -89,12 +89,14 @@ class Pursuit:
         d, passed = self.follower.task.dimension, arms.unchanged[which]
         motion = (targets - arms.given[which])[:, :d] / passed[:, None]
         length, velocity = norms(motion), arms.velocity[which]
-        steady = length <= _LEAP / self.rate  # comparison with NaN, where there was no target yet, is false
+        stale = passed > _STALE * self.rate
+        # comparison with NaN, where there was no target yet, is false
+        steady = (length <= _LEAP / self.rate) & ~stale
         moved = ~(length == 0.0)
-        straight = (motion * velocity).sum(1) >= _STRAIGHT * length * norms(velocity)
+        straight = (motion * velocity).sum(1) > _STRAIGHT * length * norms(velocity)
         share = -np.expm1(-passed / (_MEAN * self.rate))
         velocity = np.where((moved & steady)[:, None], velocity + share[:, None] * (motion - velocity), velocity)
-        velocity[moved & ~steady | ~moved & (passed > _STALE * self.rate)] = 0.0
+        velocity[moved & ~steady | ~moved & stale] = 0.0
         arms.velocity[which] = velocity
         arms.going[which] = np.where(moved & ~(steady & straight), 0, arms.going[which] + 1)
         arms.given[which] = targets
