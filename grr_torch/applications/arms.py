@@ -44,7 +44,7 @@ class Arms:
         offset_at: (B, width) where that line led; NaN where there was none.
         barred: (B, width) the last target that a route led near, without a way on from there; NaN where there is none.
         given: (B, width) the last target that was accepted; NaN where there was none.
-        unchanged: (B,) steps since it was first given; at least 1.
+        unchanged: (B,) steps since it was first given.
         velocity: (B, d) the mean motion of the targets in a step [m].
         going: (B,) steps for which they have gone straight.
         meets: (B, width) where an arm that has fallen behind meets its target, which it heads for as for a target; NaN

@@ -51,7 +51,7 @@ class Pursuit:
     def __init__(self, follower: Follower, solver: Solver, rate: float, foresight: float) -> None:
         """For `rate` control steps a second, and targets that are taken to go on so for `foresight` seconds at most."""
         self.follower, self.solver, self.rate = follower, solver, rate
-        horizon = min(math.ceil(min(foresight * rate, _FARTHEST)), _FARTHEST)
+        horizon = math.ceil(min(foresight * rate, _FARTHEST))
         self._ahead = np.unique(np.linspace(0, horizon, 1 + min(horizon, _LOOKED)).round())
 
     def aims(self, arms: Arms, which: Array, targets: Array) -> Array:

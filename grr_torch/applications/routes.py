@@ -56,8 +56,8 @@ class Routes:
             avoided: Pairs of vertices whose edges no path may take.
 
         Returns:
-            Lengths (V,), inf where there is no path, and the next vertex (V,) on it, negative at the goal and
-            where there is none.
+            Lengths (V,), as edges are measured, inf where there is no path, and the next vertex (V,) on it, negative
+            at the goal and where there is none.
         """
         graph = self._graph
         if avoided:
