@@ -34,6 +34,8 @@ _DAMPING = 0.3
 _PATIENCE = 2
 _FALLEN = 0.99
 _SACRIFICES = 3
+# a cell's spread grows by no more than so many times the way of its corners, but for very few cells
+_GROWTH = 4.0
 
 
 def certify(
@@ -58,19 +60,20 @@ def certify(
     looking, kept, looking_again = map(checkpoint.stage, ("spread", "certification", "spread-again"))
     robot, task, points = network.robot, network.task, network.targets.T
 
-    def measure(q: Tensor, stage: Stage) -> tuple[Tensor, int]:
-        spread = spreads(robot, task, points, q.T, corners, tolerances, progress, stage)
+    def measure(q: Tensor, cells: Tensor, stage: Stage) -> tuple[Tensor, int]:
+        spread = spreads(robot, task, points, q.T, cells, tolerances, progress, stage)
         return spread, int((spread > LARGEST_SPREAD).sum())
 
     with one_thread(), torch.no_grad():
-        spread, before = measure(q, looking)
+        spread, before = measure(q, corners, looking)
         if before == 0:
             return q
         suspects = spread > _SUSPECT
         moved = _drawn_together(network, corners[suspects], spread[suspects], q, tolerances, progress, kept)
         progress("certifying", _ROUNDS, _ROUNDS)
-        # cells that were not looked at may have suffered
-        _, after = measure(moved, looking_again)
+        # cells that were not looked at may have suffered, where their corners have moved far enough
+        doubtful = ~(spread + _GROWTH * _way(network, corners, q, moved) <= LARGEST_SPREAD)
+        _, after = measure(moved, corners[doubtful], looking_again)
     return moved if after < before else q
 
 
@@ -122,11 +125,16 @@ def _drawn_together(
         share = excess[pulled] / (excess[pulled] + _AIM)
         pulls = Pulls(pairs[:, pulled], apart[:, pulled] * share, torch.full_like(share, weight * (1 + done)))
         moved = move(network, q, gauss_newton_step(network, q, _DAMPING, pulls), tolerances)
-        steps = difference(q, moved, network.robot.continuous[:, None]).square().sum(0).sqrt()
-        travelled += steps[corners].amax(1)
+        travelled += _way(network, corners, q, moved)
         q = moved
         kept.keep(_state(q, best, watched, {**numbers, "done": done + 1, "ended": False}))
     return best
+
+
+def _way(network: Network, corners: Tensor, q: Tensor, moved: Tensor) -> Tensor:
+    """How far the corner of each cell (C,) that moves farthest does, from q (n, V) to `moved` (n, V) [rad]."""
+    way = difference(q, moved, network.robot.continuous[:, None]).square().sum(0).sqrt()
+    return way[corners].amax(1)
 
 
 def _leeway(spread: Tensor) -> Tensor:

@@ -30,8 +30,8 @@ class FlagCheck:
     Attributes:
         tolerances: Of the projections.
         check: What checks batches of edges.
-        progress: Told how many edges are checked, when all are for the first time.
-        kept: Where it is kept how far that is.
+        progress: Told how many edges are checked.
+        kept: Where it is kept how far that is, when all are for the first time.
     """
 
     tolerances: Tolerances
@@ -45,7 +45,11 @@ class FlagCheck:
 
     def again(self, roadmap: Roadmap, which: Tensor | None = None) -> Tensor:
         """All edges of a roadmap, or some (E,) of them, without the others beside them: as many as are asked for."""
-        return self._continuous(roadmap, roadmap.edges if which is None else roadmap.edges[which], silent, UNKEPT)
+
+        def progress(_: str, done: int, total: int) -> None:
+            self.progress("checking again", done, total)
+
+        return self._continuous(roadmap, roadmap.edges if which is None else roadmap.edges[which], progress, UNKEPT)
 
     def _continuous(self, roadmap: Roadmap, edges: Tensor, progress: Progress, kept: Stage) -> Tensor:
         parts = roadmap.points, roadmap.configurations, roadmap.resolved, edges
@@ -108,6 +112,7 @@ def without_losses(
             connected[stale] = flags.again(after, stale)
             whole = False
         elif whole or is_large(after):
+            flags.progress("checking again", len(edges), len(edges))
             return replace(after, connected=connected)
         else:
             connected, whole = flags.again(after), True

@@ -39,13 +39,14 @@ def build_stages(
         plan += [("expanding", 2.0)]
     plan += [("checking edges", edges)]
     if refine:
-        relaxing, certifying, spreads = (6.0, 37.0, 4.0) if turning else (10.0, 12.0, 14.0)
+        relaxing, certifying, spreads, doubtful = (6.0, 37.0, 4.0, 2.5) if turning else (10.0, 12.0, 14.0, 1.0)
         relaxed = [
             ("refining", relaxing),
             ("measuring cells", spreads),
             ("certifying", certifying),
-            ("measuring cells", spreads),
+            ("measuring cells", doubtful),
             ("checking edges", 1.5 * edges),
+            ("checking again", 0.7 * edges),
         ]
         plan += [("measuring cells", cells), ("repairing", 3.0 + edges), *relaxed, *(relaxed if objectives else [])]
     if reachability:
