@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from grr_torch.cli.show import NOT_CHECKED, print_json, print_rows, progress_bar, reports_errors
 
 if TYPE_CHECKING:
+    from grr_torch.applications.teleoperate import Teleoperator
     from grr_torch.applications.teleoperation_log import Summary, TeleoperationLog
-    from grr_torch.resolution.roadmap import Roadmap
 
 
 @reports_errors
@@ -40,6 +40,13 @@ def teleop(
     acceleration: Annotated[
         float | None, typer.Option(help="Acceleration limit of all joints, in rad/s²; by default none.")
     ] = None,
+    foresight: Annotated[
+        float,
+        typer.Option(
+            help="For how many seconds at most an arm that cannot follow its target takes it to go straight on, and "
+            "heads for where they will meet; 0: it heads for where the target is.",
+        ),
+    ] = 2.0,
     host: Annotated[
         str, typer.Option(help="Address of the page; by default no other machine can open it.")
     ] = "127.0.0.1",
@@ -52,6 +59,7 @@ def teleop(
 
     Example: grr-torch teleop kinova.grr --path circle --out circle.csv
     """
+    from grr_torch.applications.teleoperate import Teleoperator
     from grr_torch.applications.teleoperation_log import check_trajectory_path
     from grr_torch.output import check_outputs
     from grr_torch.resolution.roadmap import Roadmap
@@ -60,8 +68,8 @@ def teleop(
         check_trajectory_path(out)
     check_outputs({"--record": record, "--out": out}, [file, path])
     roadmap = Roadmap.load(file)
-    limits = {"max_step": max_step, "acceleration_limits": acceleration}
-    log = _replay(roadmap, path, rate, limits) if path else _interact(roadmap, rate, limits, host, port)
+    teleoperator = Teleoperator(roadmap, rate, max_step=max_step, acceleration_limits=acceleration, foresight=foresight)
+    log = _replay(teleoperator, path) if path else _interact(teleoperator, host, port)
     _write(log, record, out)
     summary = log.summary()
     if as_json:
@@ -73,19 +81,23 @@ def teleop(
         typer.echo(f"written: {files}")
 
 
-def _replay(roadmap: Roadmap, path: str, rate: float, limits: dict[str, Any]) -> TeleoperationLog:
+def _replay(teleoperator: Teleoperator, path: str) -> TeleoperationLog:
     from grr_torch.applications.example_paths import KINDS, example_path
     from grr_torch.applications.replay import read_waypoints, replay
     from grr_torch.errors import UnknownNameError
 
     if path not in KINDS and not Path(path).suffix and not Path(path).exists():
         raise UnknownNameError("path", path, KINDS, " Or the name of a file of waypoints.")
-    waypoints = example_path(roadmap, path, rate) if path in KINDS else read_waypoints(path, roadmap.task.width)
+    roadmap = teleoperator.roadmap
+    if path in KINDS:
+        waypoints = example_path(roadmap, path, teleoperator.rate)
+    else:
+        waypoints = read_waypoints(path, roadmap.task.width)
     with progress_bar() as progress:
-        return replay(roadmap, waypoints, rate, **limits, progress=progress)
+        return replay(teleoperator, waypoints, progress=progress)
 
 
-def _interact(roadmap: Roadmap, rate: float, limits: dict[str, Any], host: str, port: int) -> TeleoperationLog:
+def _interact(teleoperator: Teleoperator, host: str, port: int) -> TeleoperationLog:
     """Until Ctrl-C, or until the process is asked to end."""
     import signal
     from threading import Event
@@ -94,12 +106,12 @@ def _interact(roadmap: Roadmap, rate: float, limits: dict[str, Any], host: str, 
     from grr_torch.interactive.page import Page
     from grr_torch.interactive.session import Session
 
-    session = Session(roadmap, rate, **limits)
+    session = Session(teleoperator)
     page = Page(session, host, port)
     stop = Event()
     before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        typer.echo(f"{roadmap.robot.name} at {page.url}; Ctrl-C ends it", err=True)
+        typer.echo(f"{session.roadmap.robot.name} at {page.url}; Ctrl-C ends it", err=True)
         drive(session, page.show, stop)
     finally:
         for number, handler in before.items():

@@ -10,6 +10,7 @@ import torch
 
 from grr_torch.applications.example_paths import KINDS, example_path, middles
 from grr_torch.applications.replay import read_waypoints, replay
+from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.applications.teleoperation_log import TeleoperationLog
 from grr_torch.errors import FileFormatError, ParameterError, UnknownNameError
 from grr_torch.interactive.drive import drive
@@ -24,7 +25,7 @@ def roadmap(request, planar_roadmap, kinova_roadmap):
 
 @pytest.fixture
 def session(roadmap):
-    return Session(roadmap)
+    return Session(Teleoperator(roadmap))
 
 
 def follow(session, ticks=400):
@@ -110,7 +111,7 @@ def test_targets_stay_within_bounds_and_are_finite(session):
 def test_the_loop_ends_when_it_is_told_to(planar_roadmap):
     from threading import Event
 
-    session, stop, shown = Session(planar_roadmap, rate=200.0), Event(), []
+    session, stop, shown = Session(Teleoperator(planar_roadmap, rate=200.0)), Event(), []
 
     def show(step):
         shown.append(step)
@@ -132,7 +133,7 @@ def test_an_arm_with_slow_joints_gets_a_slower_path(kinova_roadmap):
     slow = replace(kinova_roadmap, robot=replace(robot, velocity_limits=robot.velocity_limits / 10.0))
     path = example_path(slow, "circle")
     assert len(path) > 1.5 * len(usual)
-    assert replay(slow, path).summary().largest_deviation < 2e-3
+    assert replay(Teleoperator(slow), path).summary().largest_deviation < 2e-3
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -143,7 +144,7 @@ def test_example_paths_are_followed_all_the_way(roadmap, kind):
     steps = path.diff(dim=0).norm(dim=1)
     assert float(steps.max()) * 50.0 == pytest.approx(0.15, rel=0.15)
     assert bool(roadmap.solve(path).valid.all())
-    log = replay(roadmap, path[:: max(1, len(path) // 150)], rate=10.0)
+    log = replay(Teleoperator(roadmap, rate=10.0), path[:: max(1, len(path) // 150)])
     summary = log.summary()
     assert summary.shares["holding"] == summary.shares["unreachable"] == 0.0
     assert summary.final_deviation <= 1e-3
@@ -167,20 +168,20 @@ def test_no_such_example_path(planar_roadmap):
 
 def test_a_replay_of_one_waypoint_and_of_an_unreachable_one(roadmap):
     home = middles(roadmap)
-    assert replay(roadmap, home).summary().steps == 1
+    assert replay(Teleoperator(roadmap), home).summary().steps == 1
     away = torch.cat([home, home + 5.0])
-    log = replay(roadmap, away)
+    log = replay(Teleoperator(roadmap), away)
     summary = log.summary()
     assert summary.steps == 102
     assert summary.shares["tracking"] < 0.1
     assert log.status[-1] != "tracking"
     for wrong in (home[:0], home[0], home[:, :1], home * torch.nan):
         with pytest.raises(ParameterError, match="waypoints"):
-            replay(roadmap, wrong)
+            replay(Teleoperator(roadmap), wrong)
 
 
 def test_a_log_says_what_its_steps_were(planar_roadmap):
-    log = replay(planar_roadmap, example_path(planar_roadmap, "line")[:60])
+    log = replay(Teleoperator(planar_roadmap), example_path(planar_roadmap, "line")[:60])
     summary = log.summary()
     position, _ = planar_roadmap.robot.forward_kinematics(log.configurations)
     away = (position[:, :2] - log.targets).norm(dim=1)
@@ -196,7 +197,7 @@ def test_a_log_says_what_its_steps_were(planar_roadmap):
 
 
 def test_trajectories_are_written_in_three_formats(kinova_roadmap, tmp_path):
-    log = replay(kinova_roadmap, example_path(kinova_roadmap, "circle")[:40])
+    log = replay(Teleoperator(kinova_roadmap), example_path(kinova_roadmap, "circle")[:40])
     for suffix in ("csv", "npy", "npz"):
         log.save_trajectory(tmp_path / f"q.{suffix}")
     q = log.configurations.numpy()
@@ -216,7 +217,7 @@ def test_trajectories_are_written_in_three_formats(kinova_roadmap, tmp_path):
 def test_a_recording_has_all_its_parts(roadmap, tmp_path):
     path = example_path(roadmap, "line")
     out = torch.cat([path[:40], path[:40] + 3.0])
-    record_teleoperation(replay(roadmap, out), tmp_path / "t.rrd")
+    record_teleoperation(replay(Teleoperator(roadmap), out), tmp_path / "t.rrd")
     found = entities(tmp_path / "t.rrd")
     wanted = {"target", "tool", "trace", "whole", "asked", "between", "roadmap/vertices"}
     assert {f"/space/{name}" for name in wanted} <= found
@@ -229,7 +230,7 @@ def test_a_recording_has_all_its_parts(roadmap, tmp_path):
 
 
 def test_an_arm_that_never_moves_is_recorded(planar_roadmap, tmp_path):
-    record_teleoperation(replay(planar_roadmap, middles(planar_roadmap)), tmp_path / "still.rrd")
+    record_teleoperation(replay(Teleoperator(planar_roadmap), middles(planar_roadmap)), tmp_path / "still.rrd")
     assert "/space/tool" in entities(tmp_path / "still.rrd")
 
 

@@ -16,7 +16,9 @@ from grr_torch.cli.main import app
 from test_teleop import entities
 from typer.testing import CliRunner
 
+from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.errors import MissingPackageError
+from grr_torch.experiments.paths import draw_paths
 from grr_torch.interactive.session import Session
 
 
@@ -46,6 +48,24 @@ def test_the_command_replays_records_and_sums_up(file, tmp_path):
     assert np.allclose(np.load(tmp_path / "again.npy", allow_pickle=False)[:100], first, atol=1e-9)
 
 
+def test_foresight_is_that_of_the_teleoperator(kinova_roadmap, tmp_path):
+    kinova_roadmap.save(tmp_path / "kinova.grr")
+    # through the robot's base
+    targets = draw_paths(kinova_roadmap, "line_self", 1, seed=3)[0]
+    np.savetxt(tmp_path / "line.csv", targets, delimiter=",")
+    led = {}
+    for foresight in (0.0, 2.0):
+        options = {"path": tmp_path / "line.csv", "max-step": 0.04, "foresight": foresight, "out": tmp_path / "q.npy"}
+        words = [word for name, value in options.items() for word in (f"--{name}", value)]
+        result = invoke("teleop", tmp_path / "kinova.grr", *words)
+        assert result.exit_code == 0, result.output
+        arm = Teleoperator(kinova_roadmap, max_step=0.04, foresight=foresight)
+        led[foresight] = np.stack([arm.step(target).configuration.numpy() for target in targets])
+        replayed = np.load(tmp_path / "q.npy", allow_pickle=False)
+        assert np.allclose(replayed[: len(targets)], led[foresight], atol=1e-9)
+    assert np.abs(led[2.0] - led[0.0]).max() > 0.1
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
@@ -67,7 +87,8 @@ def test_the_command_replays_records_and_sums_up(file, tmp_path):
         ("MAP --path circle --rate 0", "rate: got 0.0"),
         ("MAP --path circle --rate nan", "rate: got nan"),
         ("MAP --path circle --rate 1e300", "rate: got 1e+300"),
-        ("MAP --path wide.csv --rate nan", "has 3 columns"),
+        ("MAP --path circle --foresight -1", "foresight: got -1.0"),
+        ("MAP --path circle --foresight nan", "foresight: got nan"),
         ("MAP --path circle --max-step -1", "max_step: got -1.0"),
         ("MAP --port 70000", "Invalid value for '--port'"),
         ("none.grr --path circle", "none.grr: is not a file"),
@@ -106,7 +127,7 @@ def test_without_viser_the_message_names_the_extra(planar_roadmap, file, monkeyp
 
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(MissingPackageError, match=r"grr-torch\[interactive\]"):
-        Page(Session(planar_roadmap), port=0)
+        Page(Session(Teleoperator(planar_roadmap)), port=0)
     result = invoke("teleop", file)
     assert result.exit_code == 2
     assert "grr-torch[interactive]" in result.stderr

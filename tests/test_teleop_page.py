@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 
+from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.errors import ParameterError
 from grr_torch.interactive.drive import drive
 from grr_torch.interactive.session import Session
@@ -29,7 +30,7 @@ def opened(kinova_roadmap):
     """A page that is driven in the background, and its session."""
     from grr_torch.interactive.page import Page
 
-    session = Session(kinova_roadmap)
+    session = Session(Teleoperator(kinova_roadmap))
     page = Page(session, port=0)
     stop = threading.Event()
     loop = threading.Thread(target=drive, args=(session, page.show, stop))
@@ -179,7 +180,7 @@ def test_the_page_is_bound_to_loopback_and_a_port_in_use_is_refused(opened):
 def test_a_page_of_a_planar_arm_has_two_sliders(planar_roadmap):
     from grr_torch.interactive.page import Page
 
-    session = Session(planar_roadmap)
+    session = Session(Teleoperator(planar_roadmap))
     page = Page(session, port=0)
     try:
         page.show(session.tick())

@@ -192,7 +192,7 @@ def test_a_replay_tells_how_far_the_tool_was_turned(request, name):
     roadmap = request.getfixturevalue(name)
     path = example_path(roadmap, "circle")
     assert path.shape[1] == roadmap.task.width
-    log = replay(roadmap, path)
+    log = replay(Teleoperator(roadmap), path)
     summary = log.summary()
     assert summary.final_deviation < 2e-3
     assert summary.final_turn < 1e-2
@@ -201,11 +201,11 @@ def test_a_replay_tells_how_far_the_tool_was_turned(request, name):
     error = roadmap.task.error(target[:, None], position.T, rotation.permute(1, 2, 0))
     assert float(log.turns[-1]) == pytest.approx(float(roadmap.task.residuals(error)[1]), abs=1e-9)
     with pytest.raises(ParameterError, match="waypoints"):
-        replay(roadmap, path[:, :-1])
+        replay(Teleoperator(roadmap), path[:, :-1])
 
 
 def test_a_session_turns_its_arm(yaw):
-    session = Session(yaw)
+    session = Session(Teleoperator(yaw))
     assert session.tick().status == "tracking"
     session.nudge(3, 0.2)
     assert session.target[3] == pytest.approx(float(session.home[3]) + 0.2)
@@ -222,7 +222,7 @@ def test_the_handle_of_a_page_is_where_the_target_is(request, name):
     from grr_torch.interactive.page import Page
 
     roadmap = request.getfixturevalue(name)
-    session = Session(roadmap)
+    session = Session(Teleoperator(roadmap))
     page = Page(session, port=0)
     try:
         page.show(session.tick())

@@ -15,7 +15,6 @@ from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
 from grr_torch.errors import ParameterError
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import tool_points
-from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.tables import read_points
 
 # after the last waypoint an arm has so long to arrive [s], and has arrived when its tool is so near [m]
@@ -32,31 +31,21 @@ def read_waypoints(path: str | os.PathLike[str], width: int) -> Tensor:
     return torch.from_numpy(np.concatenate(list(read_points(Path(path), width))))
 
 
-def replay(
-    roadmap: Roadmap,
-    waypoints: Tensor,
-    rate: float = 50.0,
-    *,
-    max_step: float | None = None,
-    acceleration_limits: float | None = None,
-    progress: Progress = silent,
-) -> TeleoperationLog:
+def replay(teleoperator: Teleoperator, waypoints: Tensor, *, progress: Progress = silent) -> TeleoperationLog:
     """Lets one arm follow waypoints, one target for each control step, from the first one on.
 
     After the last waypoint the arm has up to two more seconds to arrive.
 
     Args:
-        roadmap: The roadmap.
+        teleoperator: What leads the arm.
         waypoints: (N, width) targets.
-        rate: Control steps in a second [Hz].
-        max_step: As for `Teleoperator`.
-        acceleration_limits: As for `Teleoperator`.
         progress: Told how many steps are done.
 
     Raises:
         ParameterError: There is no waypoint, one is not finite or has a direction or quaternion of length zero,
-            they are not of the task's width, or a parameter is out of its range.
+            or they are not of the task's width.
     """
+    roadmap, rate = teleoperator.roadmap, teleoperator.rate
     width = roadmap.task.width
     if waypoints.ndim != 2 or waypoints.shape[1] != width or len(waypoints) == 0:
         raise ParameterError("waypoints", tuple(waypoints.shape), f"(1 or more, {width})")
@@ -64,7 +53,6 @@ def replay(
         raise ParameterError("waypoints", "NaN or infinite values", "finite values")
     robot, task = roadmap.robot, roadmap.task
     waypoints = task.unit(waypoints.to(torch.float64))
-    teleoperator = Teleoperator(roadmap, rate, max_step=max_step, acceleration_limits=acceleration_limits)
     log = TeleoperationLog(roadmap, rate)
     total = len(waypoints) + round(_MORE_SECONDS * rate)
     for k in range(total):

@@ -13,7 +13,6 @@ from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
 from grr_torch.errors import ParameterError
 from grr_torch.projection.project import tool_points
-from grr_torch.resolution.roadmap import Roadmap
 
 # a target may leave what is resolved by this share of its size
 _BEYOND = 0.25
@@ -25,7 +24,8 @@ class Session:
     `tick` is called at the control rate by one thread; the target may be moved, and the clutch let go, by another.
 
     Attributes:
-        roadmap: The roadmap.
+        teleoperator: What leads the arm.
+        roadmap: Its roadmap.
         rate: Control steps in a second [Hz].
         low: (d,) lower bounds of the target's position [m].
         high: (d,) upper bounds of the target's position [m].
@@ -33,39 +33,18 @@ class Session:
         log: All steps.
     """
 
-    def __init__(
-        self,
-        roadmap: Roadmap,
-        rate: float = 50.0,
-        *,
-        max_step: float | None = None,
-        acceleration_limits: float | None = None,
-    ) -> None:
-        """The arm stands in the middle of its roadmap.
-
-        Args:
-            roadmap: The roadmap.
-            rate: Control steps in a second [Hz].
-            max_step: As for `Teleoperator`.
-            acceleration_limits: As for `Teleoperator`.
-
-        Raises:
-            ParameterError: A parameter is out of its range, or no vertex is resolved.
-        """
-        self.roadmap, self.rate = roadmap, rate
+    def __init__(self, teleoperator: Teleoperator) -> None:
+        """Puts the arm of a teleoperator in the middle of its roadmap."""
+        self.teleoperator = teleoperator
+        self.roadmap, self.rate = teleoperator.roadmap, teleoperator.rate
+        roadmap = self.roadmap
         self.home = middles(roadmap)[0]
         vertex = int((roadmap.points == self.home).all(1).nonzero()[0, 0])
-        self.teleoperator = Teleoperator(
-            roadmap,
-            rate,
-            start=roadmap.configurations[vertex].to(roadmap.robot.lower),
-            max_step=max_step,
-            acceleration_limits=acceleration_limits,
-        )
+        teleoperator.reset(roadmap.configurations[vertex].to(roadmap.robot.lower))
         resolved = roadmap.positions[roadmap.resolved]
         low, high = resolved.amin(0), resolved.amax(0)
         self.low, self.high = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
-        self.log = TeleoperationLog(roadmap, rate)
+        self.log = TeleoperationLog(roadmap, self.rate)
         self._target = self.tool = tuple(self.home.tolist())
         self._engaged, self._rearm = True, False
 
