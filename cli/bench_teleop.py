@@ -47,7 +47,7 @@ def teleop(
     Example: grr-torch bench teleop kinova.grr --paths mine.npz --out results.npz
     """
     from grr_torch.experiments.paths import KINDS, read_paths
-    from grr_torch.experiments.teleoperation import aggregate, run_teleoperation, save_trajectories
+    from grr_torch.experiments.teleoperation import aggregate, check_methods, run_teleoperation, save_trajectories
     from grr_torch.experiments.timing import machine
     from grr_torch.output import check_outputs
     from grr_torch.resolution.build import build
@@ -57,6 +57,7 @@ def teleop(
     names = [name.strip() for name in methods.split(",") if name.strip()]
     if not names:
         raise ParameterError("--methods", repr(methods), "some of expansion, random, newton, relaxed")
+    check_methods(names)
     if out is not None:
         if out.suffix != ".npz":
             raise ParameterError("--out", out, "a file that ends in .npz")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -152,3 +153,11 @@ def test_mistakes_are_one_line(planar_roadmap, tmp_path, monkeypatch, arguments,
     assert result.exit_code == 2
     assert complaint in result.stderr
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_misspelt_method_is_told_before_anything_is_built_or_missed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "dtw", None)
+    monkeypatch.setattr("grr_torch.resolution.build.build", None)
+    result = CliRunner().invoke(app, ["bench", "teleop", "--methods", "expansoin"])
+    assert result.exit_code == 2
+    assert "Did you mean 'expansion'?" in result.stderr

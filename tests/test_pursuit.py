@@ -131,6 +131,19 @@ def test_a_target_that_rests_or_leaps_has_no_motion(roadmap, leap):
     assert not found[50 if leap else 58].any()
 
 
+def test_what_counts_as_open_is_mostly_what_can_be_solved(roadmap, through_holes):
+    """Nearly all of what can be solved, and little of what cannot: nobody sets off for a place that is not there."""
+    longest = torch.full((7,), STEP, dtype=torch.float64)
+    pursuit = Pursuit(Follower(roadmap.robot, roadmap.task, DEFAULT_TOLERANCES, longest), roadmap.solver, 50.0, 2.0)
+    points = through_holes.reshape(1, -1, 3)
+    open_, needs = pursuit._needs(roadmap.configurations[some_vertices(roadmap, 1)].numpy(), points.numpy())
+    solvable = roadmap.solve(points).valid.numpy()
+    assert 0.2 < solvable.mean() < 0.8
+    assert (open_ & ~solvable).mean() < 0.15
+    assert (solvable & ~open_).mean() < 0.03
+    assert (np.isfinite(needs) == open_).all()
+
+
 @pytest.mark.parametrize("rate", [25.0, 100.0])
 def test_foresight_is_in_seconds(roadmap, through_holes, rate):
     """The same motion in fewer or more control steps is led as well."""

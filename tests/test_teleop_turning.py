@@ -98,6 +98,24 @@ def test_a_vertex_is_reached_from_any_other(request, name):
     assert (status[-1] == "tracking").all()
 
 
+def test_arms_meet_targets_that_cross_the_base_with_a_turned_tool(yaw):
+    """They are less far behind than arms that head for where their targets are."""
+    generator = torch.Generator().manual_seed(0)
+    angle, height, turn = torch.rand(3, 30, 1, dtype=torch.float64, generator=generator)
+    across = torch.cat([(2.0 * math.pi * angle).cos(), (2.0 * math.pi * angle).sin()], dim=1)
+    way = torch.linspace(0.5, -0.5, 200, dtype=torch.float64)[:, None, None] * across
+    rest = torch.cat([0.1 + 0.3 * height, 2.0 * math.pi * turn], dim=1)
+    targets = torch.cat([way, rest.expand(200, -1, -1)], dim=2)
+    targets = targets[:, yaw.solve(targets[[0, -1]]).valid.all(0)]
+    assert targets.shape[1] >= 20
+    behind = []
+    for foresight in (2.0, 0.0):
+        arms = Teleoperator(yaw, start=yaw.solve(targets[0]).configurations, max_step=0.04, foresight=foresight)
+        behind.append(_gaps(yaw, follow_targets(arms, targets)[0], targets).reshape(200, -1))
+    assert behind[0].mean() < 0.85 * behind[1].mean()
+    assert behind[0][-1].mean() < 0.5 * behind[1][-1].mean()
+
+
 @pytest.mark.parametrize("name", ["planar_pose", "yaw"])
 def test_a_tool_turned_once_round_is_back_where_it_was(request, name):
     """On the spot, where all rotations are resolved; its joints end where they began."""

@@ -107,10 +107,8 @@ def run_teleoperation(
     """
     if roadmap.task.rotations is not None:
         raise ParameterError("task", roadmap.task.kind, "position or fixed-rotation: the paths compared do not turn")
+    check_methods(methods)
     warping()  # known before minutes have passed
-    for method in methods:
-        if method not in METHODS:
-            raise UnknownNameError("method", method, METHODS)
     if paths is None:
         paths = {kind: draw_paths(roadmap, kind, count, seed=seed) for kind in KINDS}
     for kind, waypoints in paths.items():
@@ -126,6 +124,17 @@ def run_teleoperation(
             figures = measure(roadmap, waypoints, trajectories, RATE, closed=kind in CLOSED)
             runs.append(Run(method, kind, waypoints, trajectories, seconds, figures))
     return runs
+
+
+def check_methods(methods: Sequence[str]) -> None:
+    """Checks the names of methods.
+
+    Raises:
+        UnknownNameError: One is not of `METHODS`.
+    """
+    for method in methods:
+        if method not in METHODS:
+            raise UnknownNameError("method", method, METHODS)
 
 
 def _controller(method: str, roadmap: Roadmap, seed: int, progress: Progress) -> Controller:
