@@ -133,7 +133,9 @@ class Follower:
         on_way = self.task.interpolate_few(p[rows], targets[rows], fraction)
         starts = q[rows] + fraction * motion[rows]
         if offsets is not None:
-            starts[np.cumsum(aim.looked.sum(1)) - 1] = guesses
+            last = np.zeros_like(aim.looked)
+            last[:, -1] = True
+            starts[last[aim.looked]] = guesses
         solved, valid = self._projected(on_way.T, starts.T)
         # what is not looked at on the way does no harm: it stands where the line ends
         found = np.empty((*aim.looked.shape, self.robot.n), q.dtype)

@@ -64,8 +64,10 @@ class Pilot:
         """
         asked, targets = targets, self.pursuit.aims(arms, which, targets)
         on_route = (arms.next_vertex[which] >= 0) & arms.on_task[which]
-        blind = on_route & (arms.blind[which] > 0) & self.follower.same_goal(targets, arms.aimed[which])
-        arms.blind[which[blind]] -= 1
+        blind = on_route & (arms.blind[which] > 0)
+        if blind.any():
+            blind &= self.follower.same_goal(targets, arms.aimed[which])
+            arms.blind[which[blind]] -= 1
         wanted = self._search(arms, which, targets, arms.holds(which) & ~blind)
         steps, ends = Steps.none_yet(arms, which), np.full_like(arms.q[which], np.nan)
         round_ = _Round(arms, which, targets, steps, ends)
@@ -90,9 +92,12 @@ class Pilot:
         Returns:
             (A,) the arms for which that was due in this step; some of them wait.
         """
+        arms.turn = not arms.turn
+        if not holding.any():
+            arms.waited[which] = False
+            return holding
         leapt = ~self.follower.same_goal(targets, arms.sought[which])
         wanted = holding & (leapt | ~arms.searched[which])
-        arms.turn = not arms.turn
         search = wanted & (leapt | arms.waited[which] | arms.turn)
         waits = (wanted & ~search).nonzero()[0]
         if len(waits):
@@ -140,6 +145,8 @@ class Pilot:
         At the edge of a hole a target next to the tool often is one of a few steps that are on the other side of a
         self-motion, and the arm would turn round for them.
         """
+        if not turned.any():
+            return turned
         near = self.follower.same_goal(targets, arms.p[which]) & arms.on_task[which]
         waits = turned & near & (arms.next_vertex[which] < 0) & (arms.hesitated[which] < _HESITATION)
         arms.hesitated[which[waits]] += 1
@@ -181,6 +188,8 @@ class Pilot:
 
         Whatever the map's configuration there is now: near full stretch many are within the tolerance.
         """
+        if not lost.any():
+            return lost.copy()
         there = self.follower.task.gap_of_few(arms.held[which], arms.p[which]) <= self.follower.tolerances.position
         there &= self.follower.distance(arms.q[which], arms.held_q[which]) <= _NEAR
         return lost & there & arms.on_task[which]
