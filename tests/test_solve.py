@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import grr_torch
+from grr_torch.applications import solve
 from grr_torch.applications.many_guesses import ManyGuesses
 from grr_torch.applications.solve import STATUSES
 from grr_torch.errors import ParameterError
@@ -94,6 +95,42 @@ def test_batch_shapes_give_the_same_as_one_at_a_time(planar_roadmap, shape):
         alone = planar_roadmap.solve(points[index])
         assert torch.allclose(alone.configurations, solution.configurations[index], atol=1e-9, equal_nan=True)
         assert alone.status == solution.status[index]
+
+
+def test_many_points_give_the_same_on_any_number_of_threads(roadmap, monkeypatch, generator):
+    monkeypatch.setattr(solve, "_AT_ONCE", 500)
+    low, high = roadmap.positions.amin(0), roadmap.positions.amax(0)
+    points = low + (high - low) * torch.rand(1777, roadmap.task.width, dtype=torch.float64, generator=generator)
+    threads, seen, solutions = torch.get_num_threads(), [], []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            solutions.append(roadmap.solver(points, progress=lambda _, done, total: seen.append((done, total))))
+            assert torch.get_num_threads() == count
+    finally:
+        torch.set_num_threads(threads)
+    assert seen == 2 * [(done, 1777) for done in (0, 500, 1000, 1500, 1777)]
+    one, many = solutions
+    assert torch.equal(one.configurations.nan_to_num(9.0), many.configurations.nan_to_num(9.0))
+    assert (one.status == many.status).all()
+    assert len(np.unique(one.status)) > 1
+
+
+def test_an_error_in_a_part_of_many_points_is_not_lost(roadmap, monkeypatch):
+    monkeypatch.setattr(solve, "_AT_ONCE", 10)
+    whole = solve.Solver.solve_columns
+
+    def fails(self, columns):
+        if bool((columns == 0.25).all()):
+            raise RuntimeError("of a part")
+        return whole(self, columns)
+
+    monkeypatch.setattr(solve.Solver, "solve_columns", fails)
+    points = torch.full((60, roadmap.task.width), 0.3, dtype=torch.float64)
+    points[20:30] = 0.25
+    with pytest.raises(RuntimeError, match="of a part"):
+        roadmap.solve(points)
+    assert torch.equal(torch.isnan(roadmap.solve(points[:20]).configurations).any(1), ~roadmap.solve(points[:20]).valid)
 
 
 def test_no_points_give_no_configurations(planar_roadmap):

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from grr_torch.pieces import Array
+from grr_torch.pieces import Array, cores
 from grr_torch.spaces.product import ProductGraph
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _PLACES = {2: 4, 3: 8}
 _TURNS = {1: 2, 3: 4, 4: 6}
 # no vertex farther than so many of the longest edges counts, and one must lie within one of them
 FARTHEST = 1.5
-# of so many points the neighbours are searched for on all processors
+# of more points than so many the neighbours are searched for on all cores
 _MANY = 1000
 # distances to all vertices that are held at once
 _AT_ONCE = 1 << 21
@@ -48,7 +48,7 @@ class Around:
         k = min(NEIGHBOURS[self._d], self._count)
         places = points[:, : self._d].numpy()
         # the one after the k-th is at infinity where there is none
-        distances, nearest = self._tree.query(places, k + 1, workers=-1 if len(points) > _MANY else 1)
+        distances, nearest = self._tree.query(places, k + 1, workers=cores() if len(points) > _MANY else 1)
         weights = _weights(distances, k, FARTHEST * self._radius)
         return self._ranks(nearest[:, :k]), weights, distances[:, 0] <= self._radius
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +18,7 @@ from grr_torch.applications.around import Around, AroundProduct
 from grr_torch.applications.joined import MATRIX, Joined
 from grr_torch.applications.many_guesses import MOST_VERTICES, ManyGuesses
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import FEW, Array, Mask, one_thread, together
+from grr_torch.pieces import FEW, Array, Mask, cores, one_thread
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
@@ -30,8 +32,8 @@ if TYPE_CHECKING:
 STATUSES = ("solved", "uncertified", "outside", "too far", "not converged", "off the map", "self-collision", "no cell")
 _SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_COLLISION, _ = range(len(STATUSES))
 
-# points worked on together
-_AT_ONCE = 1 << 12
+# points worked on together, on the CPU and on a GPU: enough that the few that do not converge cost little beside them
+_AT_ONCE, _ON_GPU = 1 << 14, 1 << 16
 # radians of self-motion from the average beyond which a configuration is none of the map's
 _OFF_MAP = 0.5
 
@@ -104,17 +106,31 @@ class Solver:
         batch, count = points.shape[:-1], columns.shape[1]
         q = columns.new_empty(count, self.robot.n)
         codes = torch.empty(count, dtype=torch.uint8)
-        with one_thread():
-            at_once = together(_AT_ONCE, columns.device)
-            for start in range(0, count, at_once):
-                progress("solving", start, count)
-                part = slice(start, start + at_once)
-                solved, codes[part] = self.solve_columns(columns[:, part])
-                q[part] = solved.T
-        progress("solving", count, count)
+        done = 0
+        progress("solving", done, count)
+        for solved, found in self._in_parts(columns):
+            part = slice(done, done + len(found))
+            q[part], codes[part] = solved.T, found
+            done = part.stop
+            progress("solving", done, count)
         status = np.array(STATUSES)[codes.numpy()].reshape(batch)
         valid = (codes <= _UNCERTIFIED).to(q.device)
         return Solution(q.reshape(*batch, self.robot.n), valid.reshape(batch), status)
+
+    def _in_parts(self, columns: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """`solve_columns` for parts of points (width, N), one after the other.
+
+        On the CPU as many are worked on at a time as torch has threads: with so many points calls are long, and Python
+        can do something else meanwhile.
+        """
+        on_cpu = columns.device.type == "cpu"
+        parts = columns.split(_AT_ONCE if on_cpu else _ON_GPU, dim=1)
+        with one_thread():
+            if len(parts) == 1 or not on_cpu:
+                yield from map(self.solve_columns, parts)
+                return
+            with ThreadPoolExecutor(cores()) as threads:
+                yield from threads.map(self.solve_columns, parts)
 
     def solve_columns(self, targets: Tensor) -> tuple[Tensor, Tensor]:
         """Configurations (n, N), NaN where not valid, and indices into STATUSES (N,) for points (width, N).
