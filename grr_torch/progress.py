@@ -44,7 +44,9 @@ class Outlook:
         share = done / total if total else 1.0
         current = self._plan[self._at][0] if self._at >= 0 else None
         if stage != current or share < self._share:
-            following = (at for at in range(self._at + 1, len(self._plan)) if self._plan[at][0] == stage)
+            # one that begins anew is the next one of its name, or the same once more
+            last = self._at + 2 if stage == current else len(self._plan)
+            following = (at for at in range(self._at + 1, min(last, len(self._plan))) if self._plan[at][0] == stage)
             found = next(following, None)
             if found is None:
                 return

@@ -76,6 +76,20 @@ def test_what_was_done_before_tells_nothing_of_speed():
     assert outlook.left() == pytest.approx(50.0 + 400.0)
 
 
+def test_a_stage_that_begins_anew_does_not_stand_for_a_later_one():
+    clock = Clock()
+    outlook = Outlook([("a", 1.0), ("again", 1.0), ("b", 5.0), ("again", 1.0), ("again", 2.0)], clock)
+    outlook("a", 0, 10)
+    clock.now = 10.0
+    for done, total in ((0, 3), (3, 3), (0, 90), (90, 90)):
+        outlook("again", done, total)
+    assert outlook.left() == pytest.approx(80.0)
+    outlook("b", 0, 1)
+    outlook("again", 4, 4)
+    outlook("again", 0, 4)
+    assert outlook._at == 4, "next to each other, they are two"
+
+
 @pytest.mark.parametrize("options", [{"refine": False}, {"refine": True}, {"objectives": {"manipulability": 0.3}}])
 @pytest.mark.parametrize(("task", "rotations"), [("position", None), ("yaw", 4)])
 def test_a_build_goes_through_all_stages_that_are_foretold_of_it(task, rotations, options):

@@ -294,7 +294,7 @@ def test_progress_counts_what_is_done(kinova):
     told: dict[str, list[tuple[int, int]]] = {}
     plain = grr_torch.build(kinova, "position", points=500, refine=False)
     refine(plain, progress=lambda stage, done, total: told.setdefault(stage, []).append((done, total)))
-    assert set(told) == {"repairing", "refining", "certifying", "checking edges", "measuring cells"}
+    assert set(told) == {"repairing", "refining", "certifying", "checking edges", "checking again", "measuring cells"}
     assert all(0 <= done <= total for calls in told.values() for done, total in calls)
     assert all(calls[-1][0] == calls[-1][1] for calls in told.values())
     assert (len(plain.triangles().corners),) * 2 in told["measuring cells"]

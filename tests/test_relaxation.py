@@ -19,7 +19,7 @@ from grr_torch.resolution.certify import certify
 from grr_torch.resolution.checkpoint import UNKEPT
 from grr_torch.resolution.edges import check_edges, continuous_edges
 from grr_torch.resolution.hops import _choose, hop
-from grr_torch.resolution.refine import _network
+from grr_torch.resolution.refine import _network, refine
 from grr_torch.resolution.relax import Network
 from grr_torch.resolution.repair import repair
 from grr_torch.spaces.configuration import distance
@@ -265,3 +265,20 @@ def test_a_relaxed_map_seeds_all_its_vertices(planar_5):
     kept = distance(roadmap.configurations, seeds, planar_5.continuous)
     assert float(kept.max()) < 1e-3
     assert int(roadmap.wave.max()) == 0
+
+
+def test_cells_that_are_not_measured_after_certification_are_certified(planar_5, monkeypatch):
+    plain, measured = grr_torch.build(planar_5, "pose", points=200, refine=False), []
+    whole = certification.spreads
+
+    def noted(*arguments):
+        measured.append((arguments, whole(*arguments)))
+        return measured[-1][1]
+
+    monkeypatch.setattr(certification, "spreads", noted)
+    refine(plain)
+    (before, spread), (after, again) = measured
+    assert 0 < len(again) < 0.3 * len(spread)
+    assert int((again > 1.0).sum()) == int((whole(*after[:4], before[4], *after[5:]) > 1.0).sum())
+    # some that were certified are not any more
+    assert len(again) > int((spread > 1.0).sum())

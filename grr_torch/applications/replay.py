@@ -34,16 +34,17 @@ def read_waypoints(path: str | os.PathLike[str], width: int) -> Tensor:
 def replay(teleoperator: Teleoperator, waypoints: Tensor, *, progress: Progress = silent) -> TeleoperationLog:
     """Lets one arm follow waypoints, one target for each control step, from the first one on.
 
-    After the last waypoint the arm has up to two more seconds to arrive.
+    It starts where the teleoperator's arm stands, or at the first waypoint if that is nowhere yet. After the last one
+    it has up to two more seconds to arrive.
 
     Args:
-        teleoperator: What leads the arm.
+        teleoperator: What leads the arm; it is reset.
         waypoints: (N, width) targets.
         progress: Told how many steps are done.
 
     Raises:
         ParameterError: There is no waypoint, one is not finite or has a direction or quaternion of length zero,
-            or they are not of the task's width.
+            they are not of the task's width, or the teleoperator has several arms.
     """
     roadmap, rate = teleoperator.roadmap, teleoperator.rate
     width = roadmap.task.width
@@ -53,6 +54,7 @@ def replay(teleoperator: Teleoperator, waypoints: Tensor, *, progress: Progress 
         raise ParameterError("waypoints", "NaN or infinite values", "finite values")
     robot, task = roadmap.robot, roadmap.task
     waypoints = task.unit(waypoints.to(torch.float64))
+    teleoperator.reset()
     log = TeleoperationLog(roadmap, rate)
     total = len(waypoints) + round(_MORE_SECONDS * rate)
     for k in range(total):

@@ -34,7 +34,7 @@ class Session:
     """
 
     def __init__(self, teleoperator: Teleoperator) -> None:
-        """Puts the arm of a teleoperator in the middle of its roadmap."""
+        """Puts the arm of a teleoperator, one whatever it had before, in the middle of its roadmap."""
         self.teleoperator = teleoperator
         self.roadmap, self.rate = teleoperator.roadmap, teleoperator.rate
         roadmap = self.roadmap
