@@ -19,6 +19,7 @@ from types import SimpleNamespace
 import psutil
 import pytest
 import torch
+from command_line import PROGRAM
 from test_sweep import FLEET, SMALL, orders_of, stamps
 
 import grr_torch
@@ -123,7 +124,7 @@ def test_what_always_fails_is_reported_and_the_rest_goes_on(ray, tmp_path, marks
 
 def test_the_driver_killed_and_started_again_does_only_the_rest(tmp_path):
     (tmp_path / "s.yaml").write_text(SMALL + f"grid: {{seed: {list(range(80))}}}")
-    words = [sys.executable, "-P", "-m", "grr_torch.cli.main", "sweep", "s.yaml", "--engine", "ray", "--out", "out"]
+    words = [*PROGRAM, "sweep", "s.yaml", "--engine", "ray", "--out", "out"]
     process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     folder = tmp_path / "out"
     try:

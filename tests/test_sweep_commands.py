@@ -6,10 +6,10 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
+from command_line import PROGRAM
 from grr_torch.cli.main import app
 from test_sweep import FLEET, SMALL, stamps
 from typer.testing import CliRunner
@@ -79,7 +79,7 @@ def test_help_has_an_example(command):
 def test_ctrl_c_ends_with_130_and_the_next_run_goes_on(tmp_path):
     (tmp_path / "s.yaml").write_text(SMALL + f"grid: {{seed: {list(range(3000))}}}")
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "grr_torch.cli.main", "sweep", "s.yaml", "--out", "out"],
+        [*PROGRAM, "sweep", "s.yaml", "--out", "out"],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

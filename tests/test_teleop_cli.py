@@ -12,6 +12,7 @@ import urllib.request
 
 import numpy as np
 import pytest
+from command_line import PROGRAM
 from grr_torch.cli.main import app
 from test_teleop import entities
 from typer.testing import CliRunner
@@ -138,7 +139,7 @@ def test_a_live_session_ends_cleanly_and_leaves_its_files(file, tmp_path, number
     pytest.importorskip("viser", reason="viser is not installed")
     words = ["teleop", file, "--port", "0", "--record", "live.rrd", "--out", "live.csv"]
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "grr_torch.cli.main", *map(str, words)],
+        [*PROGRAM, *map(str, words)],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

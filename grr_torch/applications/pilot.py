@@ -189,7 +189,7 @@ class Pilot:
         Whatever the map's configuration there is now: near full stretch many are within the tolerance.
         """
         if not lost.any():
-            return lost.copy()
+            return np.zeros_like(lost)
         there = self.follower.task.gap_of_few(arms.held[which], arms.p[which]) <= self.follower.tolerances.position
         there &= self.follower.distance(arms.q[which], arms.held_q[which]) <= _NEAR
         return lost & there & arms.on_task[which]

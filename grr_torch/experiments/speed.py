@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +148,7 @@ def _kinematics(bench: _Bench) -> Iterator[Row]:
         few = q[:_ONE_BY_ONE]
         if "Pinocchio" in bench.peers:
             calls["Pinocchio"] = pinocchio_jacobian(robot, few)
-        seconds = bench.seconds(lambda q=q: robot.pose_and_jacobian(q), calls)  # type: ignore[misc]
+        seconds = bench.seconds(partial(robot.pose_and_jacobian, q), calls)
         per_one = {name: 1e6 * value / count for name, value in seconds.items()}
         if "Pinocchio" in per_one:
             per_one["Pinocchio"] *= count / len(few)
@@ -192,7 +193,7 @@ def _builds(bench: _Bench) -> Iterator[Row]:
     for name in ("planar_5", "kinova"):
         robot = load_robot(name, device=bench.robot.device)
         for task in ("position", "fixed-rotation"):
-            seconds = bench.seconds(lambda robot=robot, task=task: build(robot, task, refine=False), {})  # type: ignore[misc]
+            seconds = bench.seconds(partial(build, robot, task, refine=False), {})
             yield Row(f"build, {name} {task}, not refined", "s", seconds[""])
 
 
