@@ -36,7 +36,8 @@ class Arms:
         last_goal: (B, width) the goal it belongs to; NaN where there is none.
         left_vertex: (B,) the vertex that the route led to before, −1 where there was none, and
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
-        blind: (B,) steps for which an arm on a route follows it before it looks for a straight way to its target again.
+        swing: (B, n) the configuration that a swing leads to; NaN where there is none.
+        blind: (B,) steps for which an arm on a detour follows it before it looks for a straight way to its target.
         aimed: (B, width) the target for which it does so; a target elsewhere is looked for at once.
         doubt: (B,) how many these are the next time.
         hesitated: (B,) steps for which an arm has waited before a detour since it last went straight.
@@ -71,6 +72,7 @@ class Arms:
     last_goal: Array
     left_vertex: Array
     next_vertex: Array
+    swing: Array
     blind: Array
     aimed: Array
     doubt: Array
@@ -114,6 +116,7 @@ class Arms:
             last_goal=unknown(width),
             left_vertex=np.full(count, -1),
             next_vertex=np.full(count, -1),
+            swing=unknown(n),
             blind=np.zeros(count, dtype=np.int64),
             aimed=unknown(width),
             doubt=np.ones(count, dtype=np.int64),
@@ -148,15 +151,27 @@ class Arms:
         """Whether arms (A,) have a point to hold at: (A,)."""
         return norms(self.held[which]) < np.inf
 
+    def swings(self, which: Array) -> Mask:
+        """Whether arms (A,) are on a swing: (A,)."""
+        return ~np.isnan(self.swing[which, 0])
+
+    def detours(self, which: Array) -> Mask:
+        """Whether arms (A,) are on a route or a swing: (A,)."""
+        return (self.next_vertex[which] >= 0) | self.swings(which)
+
     def meeting(self, which: Array) -> Mask:
         """Whether arms (A,) head for where they meet their targets: (A,)."""
         return ~np.isnan(self.meets[which, 0])
 
+    def end_detour(self, which: Array) -> None:
+        """Arms (A,) that are on no route or swing any more."""
+        self.next_vertex[which], self.swing[which] = -1, np.nan
+
     def forget(self, which: Array) -> None:
-        """Arms (A,) that have no more need of a route or a point to hold at."""
+        """Arms (A,) that have no more need of a detour or a point to hold at."""
         for nothing in (self.held, self.held_q, self.barred):
             nothing[which] = np.nan
-        self.next_vertex[which] = -1
+        self.end_detour(which)
         self.blind[which], self.hesitated[which] = 0, 0
         for arm in which.tolist():
             self.avoided[arm] = frozenset()

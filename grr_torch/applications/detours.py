@@ -1,4 +1,4 @@
-"""Detours over the roadmap: the quickest paths of arms to where they cannot go straight."""
+"""Detours of arms to where they cannot go straight: swings, and the quickest routes over the roadmap."""
 
 from __future__ import annotations
 
@@ -29,23 +29,39 @@ _ARRIVED = 1e-6
 
 
 class Detours:
-    """Leads arms over the roadmap. Works on arrays, as `Follower` does."""
+    """Leads arms on swings and over the roadmap. Works on arrays, as `Follower` does."""
 
     def __init__(self, follower: Follower, solver: Solver, routes: Routes) -> None:
         self.follower, self.solver, self.routes = follower, solver, routes
 
-    def set_goals(self, arms: Arms, which: Array, goals: Array, goals_q: Array) -> None:
-        """Looks for the last vertices of arms' routes again, where the goals (A, width) have moved."""
+    def set_goals(self, arms: Arms, which: Array, goals: Array) -> None:
+        """Arms have no way straight to goals (A, width); where these have moved, there is no route to them yet."""
         moved = ~self.follower.same_goal(goals, arms.last_goal[which])
         # whose straight way to the same goal came to nothing trusts the next one later, lest it goes to and fro
-        again = arms.next_vertex[which] < 0
+        again = ~arms.detours(which)
         longer = np.minimum(np.where(again, 2 * arms.doubt[which], arms.doubt[which]), _MOST_DOUBT)
         arms.doubt[which] = np.where(moved, 1, longer)
-        if moved.any():
-            for arm in which[moved].tolist():
-                arms.avoided[arm] = frozenset()
-            arms.last_goal[which[moved]] = goals[moved]
-            arms.last_vertex[which[moved]] = self._last_vertices(goals[moved], goals_q[moved])
+        for arm in which[moved].tolist():
+            arms.avoided[arm] = frozenset()
+        arms.last_goal[which[moved]], arms.last_vertex[which[moved]] = goals[moved], -1
+
+    def swing(self, arms: Arms, which: Array, goals_q: Array, *, wholly: bool) -> tuple[Array, Mask]:
+        """Steps (A, n) of arms on swings to configurations (A, n), and which of the swings (A,) are free.
+
+        No route is quicker than a swing. One that is not looked at `wholly` is free if the step is.
+        """
+        lines = self.follower.swing(arms.q[which], arms.p[which], goals_q, self.solver.bounds, wholly=wholly)
+        free = lines.direct if wholly else lines.safe
+        arms.end_detour(which)
+        arms.swing[which[free]] = goals_q[free]
+        arms.blind[which[self.follower.distance(lines.steps, goals_q) < _ARRIVED]] = 0
+        return lines.steps, free
+
+    def set_last_vertices(self, arms: Arms, which: Array, goals: Array, goals_q: Array) -> None:
+        """Looks for last vertices of routes to goals (A, width), configurations (A, n), where they are not known."""
+        unknown = arms.last_vertex[which] < 0
+        if unknown.any():
+            arms.last_vertex[which[unknown]] = self._last_vertices(goals[unknown], goals_q[unknown])
 
     def follow(self, arms: Arms, which: Array, briefly: Mask) -> tuple[Array, Mask]:
         """Steps (A, n) of arms on the quickest paths to their last vertices, and which found no way (A,).

@@ -127,7 +127,7 @@ class Follower:
             pace: (B,) the most of a line that one step covers, above 0; from 1 on, the default, all of it.
         """
         motion = self.difference(q, guesses if offsets is None else guesses + offsets)
-        aim = self._aim(q, motion, pace)
+        aim = self._aim(q, motion, pace, _MOST_PIECES)
         rows = aim.looked.nonzero()[0]
         fraction = aim.fractions[aim.looked][:, None]
         on_way = self.task.interpolate_few(p[rows], targets[rows], fraction)
@@ -136,30 +136,57 @@ class Follower:
             last = np.zeros_like(aim.looked)
             last[:, -1] = True
             starts[last[aim.looked]] = guesses
-        solved, valid = self._projected(on_way.T, starts.T)
-        # what is not looked at on the way does no harm: it stands where the line ends
-        found = np.empty((*aim.looked.shape, self.robot.n), q.dtype)
-        reached = np.empty(aim.looked.shape, dtype=bool)
-        found[aim.looked], reached[aim.looked] = solved.T, valid
-        found = np.where(aim.looked[..., None], found, found[:, -1:])
-        reached = np.where(aim.looked, reached, reached[:, -1:])
+        found, reached = self._projected(aim, on_way.T, starts.T)
         after = np.where(aim.near[:, None], targets, self.task.interpolate_few(p, targets, aim.fractions[:, -2, None]))
         return self._judge(aim, found, reached, after, p, targets)
 
-    def _projected(self, points: Array, guesses: Array) -> tuple[Array, Mask]:
-        """`project_columns` for arrays, self-collision left open."""
-        if guesses.shape[1] <= FEW:
-            return project_few(self.robot, self.task, self.tolerances, points, guesses)
-        columns = torch.from_numpy(points), torch.from_numpy(guesses)
-        solved, valid = project_columns(self.robot, self.task, *columns, self.tolerances, check_collision=False)
-        return solved.numpy(), valid.numpy()
+    def swing(self, q: Array, p: Array, goals: Array, bounds: tuple[Array, Array], *, wholly: bool) -> Lines:
+        """Swings: motions on which the joints go straight, and the tool where that leads it, turned as the task asks.
 
-    def _aim(self, q: Array, motion: Array, pace: Array | float) -> _Aim:
-        """Which points on lines with motions (B, n) are looked at: no farther than half of ε apart."""
+        Args:
+            q: (B, n) configurations.
+            p: (B, width) the points where their tools are.
+            goals: (B, n) where they go, at points of the task.
+            bounds: (d,) each: tools do not go below the one, nor above the other [m].
+            wholly: Whether all of the swings is looked at, or only the step, and none is `direct`.
+        """
+        motion = self.difference(q, goals)
+        # all that is between two neighbouring points is less than ε: there are no gaps to look into
+        aim = self._aim(q, motion, 1.0, math.inf if wholly else 0.0)._replace(length=np.full(len(q), np.inf))
+        guesses = (q[:, None] + aim.fractions[..., None] * motion[:, None])[aim.looked]
+        position, rotation = self.robot.forward_kinematics(torch.from_numpy(guesses))
+        points = self.task.at(position.T, rotation.permute(1, 2, 0)).numpy()
+        found, reached = self._projected(aim, points, guesses.T)
+        positions = points[: self.task.dimension].T
+        reached[aim.looked] &= ((positions >= bounds[0]) & (positions <= bounds[1])).all(1)
+        return self._judge(aim, found, reached, np.full_like(p, np.nan), p, p)
+
+    def _projected(self, aim: _Aim, points: Array, guesses: Array) -> tuple[Array, Mask]:
+        """Configurations (B, K + 1, n) at the points (width, M) looked at, and which meet these (B, K + 1).
+
+        What is not looked at on the way does no harm: it stands where the line ends.
+        """
+        if guesses.shape[1] <= FEW:
+            solved, valid = project_few(self.robot, self.task, self.tolerances, points, guesses)
+        else:
+            columns = torch.from_numpy(points), torch.from_numpy(guesses)
+            pair = project_columns(self.robot, self.task, *columns, self.tolerances, check_collision=False)
+            solved, valid = (part.numpy() for part in pair)
+        found = np.empty((*aim.looked.shape, self.robot.n), guesses.dtype)
+        reached = np.empty(aim.looked.shape, dtype=bool)
+        found[aim.looked], reached[aim.looked] = solved.T, valid
+        found = np.where(aim.looked[..., None], found, found[:, -1:])
+        return found, np.where(aim.looked, reached, reached[:, -1:])
+
+    def _aim(self, q: Array, motion: Array, pace: Array | float, most: float) -> _Aim:
+        """Which points on lines with motions (B, n) are looked at: no farther than half of ε apart.
+
+        Of a line of more than `most` pieces, none on the way is.
+        """
         share = np.minimum(self.share(motion), pace)
         near, length = share >= _SLACK, norms(motion)
         pieces = np.maximum(np.ceil(2.0 * length / self.epsilon), 1.0)
-        short = pieces <= _MOST_PIECES
+        short = pieces <= most
         most = int(pieces[short].max()) if short.any() else 2
         on_way = np.arange(1, most + 1)
         looked = np.empty((len(q), most + 1), dtype=bool)

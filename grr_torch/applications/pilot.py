@@ -63,7 +63,7 @@ class Pilot:
         only follows the route; and points to hold at are searched for in every other step, of all arms at once.
         """
         asked, targets = targets, self.pursuit.aims(arms, which, targets)
-        on_route = (arms.next_vertex[which] >= 0) & arms.on_task[which]
+        on_route = arms.detours(which) & arms.on_task[which]
         blind = on_route & (arms.blind[which] > 0)
         if blind.any():
             blind &= self.follower.same_goal(targets, arms.aimed[which])
@@ -127,17 +127,27 @@ class Pilot:
             every = np.ones(len(fresh), dtype=bool)
             again, found[fresh], _, direct[fresh] = self._straight(arms, which[fresh], targets[fresh], every)
             made.put(fresh, again)
-        arms.next_vertex[which[direct]] = -1
+        arms.end_detour(which[direct])
         away = ~direct & ~self._hesitate(arms, which, targets, valid & ~direct, made)
         arms.held[which[away & valid]], arms.held_q[which[away & valid]] = np.nan, np.nan
         round_.steps.put(rows, made)
         round_.ends[rows], routed[rows] = found, away
         away &= arms.on_task[which]
         if away.any():
-            chosen, goals = which[away], np.where(valid[:, None], targets, arms.held[which])
-            self.detours.set_goals(arms, chosen, goals[away], found[away])
+            chosen, goals = which[away], np.where(valid[:, None], targets, arms.held[which])[away]
+            self.detours.set_goals(arms, chosen, goals)
             arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[away]
+            on_swing = self._swing(round_, rows[away], found[away], wholly=True)
+            routed[rows[away][on_swing]] = False
+            others = ~on_swing
+            self.detours.set_last_vertices(arms, chosen[others], goals[others], found[away][others])
         return routed
+
+    def _swing(self, round_: _Round, rows: Array, goals_q: Array, *, wholly: bool) -> Mask:
+        """Sets the steps of arms, by their rows, that are free to swing to configurations (R, n): (R,)."""
+        steps, free = self.detours.swing(round_.arms, round_.which[rows], goals_q, wholly=wholly)
+        round_.steps.q[rows[free]] = steps[free]
+        return free
 
     def _hesitate(self, arms: Arms, which: Array, targets: Array, turned: Mask, steps: Steps) -> Mask:
         """Which of the arms (A,) whose way has just `turned` into a detour (A,) wait instead of setting off on it.
@@ -148,7 +158,7 @@ class Pilot:
         if not turned.any():
             return turned
         near = self.follower.same_goal(targets, arms.p[which]) & arms.on_task[which]
-        waits = turned & near & (arms.next_vertex[which] < 0) & (arms.hesitated[which] < _HESITATION)
+        waits = turned & near & ~arms.detours(which) & (arms.hesitated[which] < _HESITATION)
         arms.hesitated[which[waits]] += 1
         steps.points[waits], steps.codes[waits] = arms.p[which[waits]], HOLDING
         return waits
@@ -238,7 +248,11 @@ class Pilot:
         """
         arms, which, targets, steps, ends = round_
         left = (routed & ~arms.on_task[which]) | on_way
-        rows = (routed & arms.on_task[which] | on_way).nonzero()[0]
+        swinging = on_way & arms.swings(which)
+        rows = swinging.nonzero()[0]
+        if len(rows):
+            left[rows] = ~self._swing(round_, rows, arms.swing[which[rows]], wholly=False)
+        rows = (routed & arms.on_task[which] | on_way & ~swinging).nonzero()[0]
         if len(rows):
             chosen = which[rows]
             steps.q[rows], left[rows] = self.detours.follow(arms, chosen, (briefly | routed)[rows])
@@ -255,7 +269,7 @@ class Pilot:
 
     def _back(self, arms: Arms, arm: int, goal_q: Array) -> Array | None:
         """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near."""
-        arms.next_vertex[arm] = -1
+        arms.end_detour(np.array([arm]))
         near = self.solver.nearest(torch.from_numpy(arms.p[arm][None]), _WAYS_BACK)[1][0]
         ends = self.solver.configurations[near].numpy()
         here = self.solver.solve_columns(torch.from_numpy(arms.p[arm][:, None]))[0].T.numpy()

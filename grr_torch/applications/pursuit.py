@@ -31,6 +31,9 @@ _STRAIGHT = 0.8
 _MOVED = 0.05
 # what has gone straight so long is taken to go on for so many times as long
 _AS_LONG = 1.5
+# of the way from where a target comes out of a hole to where it can be met in time: an arm heads for that, for to be
+# on the target's path again sooner is worth being a little late
+_LATE = 0.5
 # what is not so far [s] is come to along the edge of reach
 _FAR = 0.4
 # steps in which an arm that is next to its target can be there
@@ -44,8 +47,8 @@ class Pursuit:
 
     A target is taken to go on straight, as fast as it has been, for half as long again as it has done so. An arm whose
     target has gone into a hole of the map waits as near as it can, and sets off for the other side when it has to in
-    order to be there in time. Once it is on such a way, or on a detour, it heads for the first point at which it can be
-    when the target comes there, until it has caught up.
+    order to be there in time. If it is too late for that, it heads for a point beyond the hole, somewhat before the
+    first one at which it can be in time. From then on it heads for the first such point, until it has caught up.
     """
 
     def __init__(self, follower: Follower, solver: Solver, rate: float, foresight: float) -> None:
@@ -59,7 +62,7 @@ class Pursuit:
         if len(self._ahead) < 2:
             return targets
         self._watch(arms, which, targets)
-        behind = arms.meeting(which) | (arms.next_vertex[which] >= 0)
+        behind = arms.meeting(which)
         due = behind | arms.holds(which) & ~arms.solvable[which]
         if not due.any():
             arms.looks_in[which] = 0
@@ -106,13 +109,20 @@ class Pursuit:
         """Looks for where arms (A,) meet targets (A, width); those that are not `behind` (A,) may wait."""
         steps, points = self._ahead, self._on_way(targets, arms.velocity[which], self._ahead)
         open_, needs = self._needs(arms.q[which], points)
-        in_time = (needs <= steps) & (steps <= _AS_LONG * arms.going[which, None])
-        first, rows = in_time.argmax(1), np.arange(len(which))
-        # where the way out of the hole is, if the target is in one
-        out = open_.argmax(1)
+        known, rows = steps <= _AS_LONG * arms.going[which, None], np.arange(len(which))
+        in_time = (needs <= steps) & known
+        # on the other side of a hole that is ahead of the target, or that it is in
+        shut = ~open_
+        shut[:, 0] |= ~behind
+        beyond = open_ & known & np.logical_or.accumulate(shut, axis=1) & (needs >= _FAR * self.rate)
+        first, out, can_meet = in_time.argmax(1), beyond.argmax(1), in_time & beyond
+        met = np.where(can_meet.any(1), can_meet.argmax(1), len(steps) - 1)
+        across = beyond.any(1) & (needs[rows, out] >= steps[out])
+        near_out = out + np.round(_LATE * (met - out)).astype(np.int64)
+        first = np.where(across, np.where(open_[rows, near_out], near_out, out), first)
         near = behind & (needs[:, 0] <= _NEXT_TO)
         arms.caught_up[which] = np.where(near, arms.caught_up[which] + _EVERY, 0)
-        meets = in_time.any(1) & (behind | (needs[rows, out] >= np.maximum(steps[out], _FAR * self.rate)))
+        meets = in_time.any(1) & behind | can_meet.any(1) & across
         meets &= (first > 0) & (arms.caught_up[which] < _CAUGHT_UP * self.rate)
         place = points[rows, first]
         kept = self.follower.task.gap_of_few(place, arms.meets[which]) < _MOVED

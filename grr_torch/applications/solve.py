@@ -84,7 +84,7 @@ class Solver:
         self.vertices = vertices
         self.low = points.amin(0)
         slack = 1e-9
-        self._low, self._high = self.low.numpy() - slack, points.amax(0).numpy() + slack
+        self.bounds = self.low.numpy() - slack, points.amax(0).numpy() + slack
         self.radius = roadmap.longest_edge
         turning = self.task.rotations is not None
         self._around = (AroundProduct if turning else Around)(roadmap, vertices, self.radius)
@@ -189,7 +189,7 @@ class Solver:
         if certified:
             self._mark_uncertified(codes, positions, nearest)
         codes[~known] = _TOO_FAR
-        codes[((positions < self._low) | (positions > self._high)).any(1)] = _OUTSIDE
+        codes[((positions < self.bounds[0]) | (positions > self.bounds[1])).any(1)] = _OUTSIDE
         return averages, torch.from_numpy(codes)
 
     def _known(self, points: Tensor, of_nearest: bool) -> tuple[Tensor, Array, Mask]:

@@ -54,9 +54,10 @@ class Teleoperator:
     """Follows targets with arms, within their velocity limits and free of self-collision (Section IV-E).
 
     In every step each arm goes straight to its target's configuration on the map, if the line there is continuous.
-    If not, a way over the roadmap is searched for. Where the target cannot be reached, the arm goes to the nearest
-    point that can, and slides along the edge of what is reachable as the target moves. If the target is about to come
-    out on the other side of a hole, it goes there in time.
+    If not, its joints go straight there while the tool stays turned as the task asks; where that is not free, a way
+    over the roadmap is searched for. Where the target cannot be reached, the arm goes to the nearest point that can,
+    and slides along the edge of what is reachable as the target moves. If the target is about to come out on the other
+    side of a hole, it goes there in time.
 
     An arm may start anywhere: off the map, outside a limit, in contact. It then goes back by straight joint-space
     motions, and from a contact never deeper into it.

@@ -1,0 +1,137 @@
+"""Swings: joints go straight to a configuration, and the tool stays turned as the task asks."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from teleoperated import follow_targets, some_vertices
+
+import grr_torch
+from grr_torch import Teleoperator
+from grr_torch.applications.lines import SUBSTEPS, Follower, Lines
+from grr_torch.projection.project import DEFAULT_TOLERANCES
+
+STEP = 0.04
+PAIRS = 60
+
+
+@pytest.fixture(scope="module", params=["kinova_roadmap", "planar_roadmap"])
+def roadmap(request) -> grr_torch.Roadmap:
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture(scope="module")
+def follower(roadmap) -> Follower:
+    longest = torch.full((roadmap.robot.n,), STEP, dtype=torch.float64)
+    return Follower(roadmap.robot, roadmap.task, DEFAULT_TOLERANCES, longest)
+
+
+@pytest.fixture(scope="module")
+def pairs(roadmap) -> tuple[torch.Tensor, torch.Tensor]:
+    """Vertices (PAIRS,) from where, and to where."""
+    return some_vertices(roadmap, PAIRS, 1), some_vertices(roadmap, PAIRS, 2)
+
+
+def _swing(roadmap, follower, q, p, goals, bounds=None, wholly=True) -> Lines:
+    return follower.swing(q, p, goals, roadmap.solver.bounds if bounds is None else bounds, wholly=wholly)
+
+
+def _at(roadmap, vertices):
+    return roadmap.configurations[vertices].numpy().copy(), roadmap.points[vertices].numpy().copy()
+
+
+def test_a_free_swing_arrives_in_time_on_its_task_and_never_collides(roadmap, follower, pairs):
+    (q, p), (goals, _) = (_at(roadmap, vertices) for vertices in pairs)
+    free = _swing(roadmap, follower, q, p, goals).direct
+    assert free.mean() > 0.3
+    q, p, goals = q[free], p[free], goals[free]
+    lengths = np.abs(follower.difference(q, goals)).max(1) / STEP
+    arrived = np.full(len(q), np.inf)
+    fractions = torch.arange(1, SUBSTEPS + 1, dtype=torch.float64)[:, None, None] / SUBSTEPS
+    for step in range(1, 200):
+        lines = _swing(roadmap, follower, q, p, goals, wholly=False)
+        assert lines.safe.all()
+        assert not lines.direct.any(), "it is not looked at to its end"
+        motion = torch.from_numpy(lines.steps - q)
+        assert float(motion.abs().max()) <= STEP
+        assert not bool(roadmap.robot.in_self_collision(torch.from_numpy(q) + fractions * motion).any())
+        q = lines.steps
+        position, rotation = roadmap.robot.forward_kinematics(torch.from_numpy(q))
+        points = roadmap.task.at(position.T, rotation.permute(1, 2, 0))
+        error = roadmap.task.residuals(roadmap.task.error(points, position.T, rotation.permute(1, 2, 0)))[1]
+        assert float(error.max()) <= DEFAULT_TOLERANCES.rotation
+        arrived = np.minimum(arrived, np.where(follower.distance(q, goals) < 1e-6, step, np.inf))
+    # a little less than the longest step is asked for, and what the projection adds is cut off
+    assert (arrived <= 1.1 * lengths + 3.0).all()
+
+
+@pytest.mark.parametrize("roadmap", ["kinova_roadmap"], indirect=True)
+def test_a_swing_that_jumps_or_collides_is_not_free(roadmap, follower, generator):
+    """Between any postures, looked at in eight times as many places."""
+    robot, task = roadmap.robot, roadmap.task
+    points = roadmap.points[some_vertices(roadmap, 200)]
+    q, valid = grr_torch.project(robot, task, points, robot.sample(200, generator))
+    half = int(valid.sum()) // 2
+    (q, goals), p = (part.numpy().copy() for part in q[valid][: 2 * half].split(half)), points[valid][:half].numpy()
+    free = _swing(roadmap, follower, q, p, goals).direct
+    motion = follower.difference(q, goals)
+    count = int(8 * math.ceil(2.0 * np.linalg.norm(motion, axis=1).max() / follower.epsilon))
+    along = torch.from_numpy(q + np.linspace(0.0, 1.0, count)[:, None, None] * motion).reshape(-1, robot.n)
+    position, rotation = robot.forward_kinematics(along)
+    tools = task.at(position.T, rotation.permute(1, 2, 0)).T
+    low, high = (torch.from_numpy(bound) for bound in roadmap.solver.bounds)
+    placed, valid = grr_torch.project(robot, task, tools, along)
+    valid &= ((tools >= low) & (tools <= high)).all(1)
+    placed, blocked = placed.reshape(count, half, -1).numpy(), ~valid.reshape(count, half).numpy()
+    jumps = (follower.distance(placed[:-1], placed[1:]) > follower.epsilon).any(0)
+    # between two places that a swing is looked at, a corner of a link may touch
+    assert not (free & ((blocked[:-10] & blocked[10:]).any(0) | jumps)).any()
+    assert 0 < free.sum() < half
+    assert (free | blocked.any(0) | jumps).mean() > 0.95
+
+
+def test_a_swing_does_not_leave_the_bounds(roadmap, follower, pairs):
+    (q, p), (goals, ends) = (_at(roadmap, vertices) for vertices in pairs)
+    free = _swing(roadmap, follower, q, p, goals).direct
+    fractions = np.linspace(0.0, 1.0, 50)[:, None, None]
+    along = torch.from_numpy(q + fractions * follower.difference(q, goals))
+    tools = roadmap.robot.forward_kinematics(along)[0][..., : p.shape[1]].numpy()
+    for axis in range(p.shape[1]):
+        # between the higher of the ends and the highest point on the way
+        limit = 0.5 * (np.maximum(p, ends)[:, axis] + tools[..., axis].max(0))
+        rises = free & (tools[..., axis].max(0) > np.maximum(p, ends)[:, axis] + 0.02)
+        assert rises.any()
+        for row in rises.nonzero()[0]:
+            high = np.full(p.shape[1], np.inf)
+            high[axis] = limit[row]
+            one = slice(row, row + 1)
+            assert not _swing(roadmap, follower, q[one], p[one], goals[one], (-high * np.inf, high)).direct.any()
+
+
+def test_a_goal_that_is_not_known_is_not_swung_to(roadmap, follower, pairs):
+    q, p = _at(roadmap, pairs[0])
+    for wholly in (True, False):
+        lines = _swing(roadmap, follower, q, p, np.full_like(q, np.nan), wholly=wholly)
+        assert not (lines.direct | lines.safe).any()
+
+
+@pytest.mark.parametrize("height", [-0.46, -0.42, -0.38])
+def test_an_arm_turns_on_the_spot_for_a_line_past_its_own_axis(kinova_roadmap, height):
+    """Half a turn of the base within a centimetre: no way round over vertices that are 15 cm away."""
+    x = torch.linspace(-0.3, 0.3, 200, dtype=torch.float64)
+    angles = torch.arange(6, dtype=torch.float64)
+    cos, sin, beside = angles.cos(), angles.sin(), 0.005
+    line = torch.stack(
+        [x[:, None] * cos - beside * sin, x[:, None] * sin + beside * cos, torch.full((200, 6), height)], dim=2
+    )
+    assert bool(kinova_roadmap.solve(line).valid.all())
+    arms = Teleoperator(kinova_roadmap, max_step=STEP)
+    q, status = follow_targets(arms, torch.cat([line, line[-1:].expand(80, -1, -1)]))
+    tools = kinova_roadmap.robot.forward_kinematics(q)[0]
+    away = torch.cdist(tools.transpose(0, 1), line.transpose(0, 1)).amin(2)
+    assert float(away.max()) < 0.08
+    assert (status == "detouring").any(0).all()
+    assert float((tools[-1] - line[-1]).norm(dim=1).max()) < 1e-3
