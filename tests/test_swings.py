@@ -11,7 +11,8 @@ from teleoperated import follow_targets, some_vertices
 
 import grr_torch
 from grr_torch import Teleoperator
-from grr_torch.applications.lines import SUBSTEPS, Follower, Lines
+from grr_torch.applications.lines import Follower, Lines
+from grr_torch.applications.motions import SUBSTEPS
 from grr_torch.projection.project import DEFAULT_TOLERANCES
 
 STEP = 0.04

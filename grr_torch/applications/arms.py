@@ -23,6 +23,7 @@ class Arms:
         speed: (B, n) what they moved in the last step, where accelerations are limited.
         p: (B, width) where their tools are.
         on_task: (B,) arms that meet their task's rotation and the joint limits and are free of self-collision.
+        tracks: (B,) arms that went straight to their targets in the last step.
         held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
         held_q: (B, n) configurations there.
         due: (B,) steps that are left in which an arm is to come there; at least 1.
@@ -59,6 +60,7 @@ class Arms:
     speed: Array
     p: Array
     on_task: Mask
+    tracks: Mask
     held: Array
     held_q: Array
     due: Array
@@ -103,6 +105,7 @@ class Arms:
             speed=np.zeros_like(q),
             p=unknown(width),
             on_task=np.zeros(count, dtype=bool),
+            tracks=np.zeros(count, dtype=bool),
             held=unknown(width),
             held_q=unknown(n),
             due=np.ones(count, dtype=np.int64),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from grr_torch.applications.lines import SUBSTEPS, Follower
+from grr_torch.applications.lines import Follower
+from grr_torch.applications.motions import SUBSTEPS
 from grr_torch.applications.rejoin import clearance
 from grr_torch.spaces.configuration import difference
 

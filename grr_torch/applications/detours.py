@@ -45,17 +45,27 @@ class Detours:
             arms.avoided[arm] = frozenset()
         arms.last_goal[which[moved]], arms.last_vertex[which[moved]] = goals[moved], -1
 
-    def swing(self, arms: Arms, which: Array, goals_q: Array, *, wholly: bool) -> tuple[Array, Mask]:
-        """Steps (A, n) of arms on swings to configurations (A, n), and which of the swings (A,) are free.
+    def swing(self, arms: Arms, which: Array, goals_q: Array) -> tuple[Array, Array, Mask]:
+        """Swings of arms to configurations (A, n), or next to them. No route is quicker.
 
-        No route is quicker than a swing. One that is not looked at `wholly` is free if the step is.
+        One that an arm is already on has been looked at; of it only the step is.
+
+        Returns:
+            Steps (A, n), the points (A, width) where tools are after them, and which swings (A,) are free.
         """
-        lines = self.follower.swing(arms.q[which], arms.p[which], goals_q, self.solver.bounds, wholly=wholly)
-        free = lines.direct if wholly else lines.safe
+        under_way = self.follower.distance(arms.swing[which], goals_q) < self.follower.epsilon
+        ends = np.where(under_way[:, None], arms.swing[which], goals_q)
+        steps, points, free = arms.q[which], arms.p[which], np.zeros_like(under_way)
+        for wholly, rows in ((False, under_way.nonzero()[0]), (True, (~under_way).nonzero()[0])):
+            if len(rows):
+                placed = arms.q[which[rows]], arms.p[which[rows]]
+                lines = self.follower.swing(*placed, ends[rows], self.solver.bounds, wholly=wholly)
+                steps[rows], points[rows] = lines.steps, lines.points
+                free[rows] = lines.direct if wholly else lines.safe
         arms.end_detour(which)
-        arms.swing[which[free]] = goals_q[free]
-        arms.blind[which[self.follower.distance(lines.steps, goals_q) < _ARRIVED]] = 0
-        return lines.steps, free
+        arms.swing[which[free]] = ends[free]
+        arms.blind[which[self.follower.distance(steps, ends) < _ARRIVED]] = 0
+        return steps, points, free
 
     def set_last_vertices(self, arms: Arms, which: Array, goals: Array, goals_q: Array) -> None:
         """Looks for last vertices of routes to goals (A, width), configurations (A, n), where they are not known."""

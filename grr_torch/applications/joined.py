@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from grr_torch.pieces import some
+
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
@@ -46,7 +48,7 @@ class Joined:
         around = np.where(counts, (joined @ bits | bits) & counted[:, None], 0)
         # most points have all of them in one part: what the first is joined to, and so on
         part, before = around[:, 0], around[:, 0] * 0
-        while (part != before).any():
+        while some(part != before):
             before = part
             part = np.bitwise_or.reduce(np.where(part[:, None] & bits, around, 0), axis=1)
         left = (part != counted).nonzero()[0]

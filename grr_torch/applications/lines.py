@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import FEW, Array, Mask, norms
+from grr_torch.applications.motions import SLACK, Motions
+from grr_torch.pieces import Array, Mask, norms, some
 from grr_torch.projection.continuity import continuous_columns
-from grr_torch.projection.few import project_few
-from grr_torch.projection.project import Tolerances, project_columns
-from grr_torch.robots.robot import Robot
-from grr_torch.spaces.task import TaskSpace
 
-# configurations between two steps at which self-collision is checked, the second step's own included
-SUBSTEPS = 8
 # a line of more pieces is not followed at once
 _MOST_PIECES = 24
 # a gap between points on a line of so many ε is one to another posture, whatever joins them
@@ -28,12 +22,6 @@ _WIDEST = 2.0
 _BRIDGED = 1.5
 # and it is looked into by so many bisections: what spans ε or more even in an eighth of the gap is a jump
 _BISECTIONS = 3
-# points no farther apart than this [m] are the same goal
-_SAME_GOAL = 0.03
-# of the longest step, so that what the projection adds seldom has to be cut off
-_SLACK = 0.98
-# what the length of a motion counts beside the steps that its slowest joint takes
-_TIE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,26 +69,8 @@ class _Aim(NamedTuple):
     looked: Mask
 
 
-@dataclass(frozen=True, eq=False)
-class Follower:
-    """How arms follow lines. Works on arrays: of so few numbers a call of numpy takes a third of the time of torch's.
-
-    Attributes:
-        robot: The robot.
-        task: The task space.
-        tolerances: When a configuration counts as being at a point.
-        longest: (n,) the most that a joint moves in a control step [rad or m].
-    """
-
-    robot: Robot
-    task: TaskSpace
-    tolerances: Tolerances
-    longest: Tensor
-
-    @property
-    def epsilon(self) -> float:
-        """ε of the continuity check: 0.05 √n [rad]."""
-        return 0.05 * math.sqrt(self.robot.n)
+class Follower(Motions):
+    """How arms follow straight lines of the task space, and swing. Works on arrays, as `Motions` does."""
 
     def follow(
         self,
@@ -127,7 +97,10 @@ class Follower:
             pace: (B,) the most of a line that one step covers, above 0; from 1 on, the default, all of it.
         """
         motion = self.difference(q, guesses if offsets is None else guesses + offsets)
-        aim = self._aim(q, motion, pace, _MOST_PIECES)
+        share = np.minimum(self.share(motion), pace)
+        if (share >= SLACK).all():
+            return self._arrive(q, p, guesses, targets, norms(motion))
+        aim = self._aim(q, motion, share, _MOST_PIECES)
         rows = aim.looked.nonzero()[0]
         fraction = aim.fractions[aim.looked][:, None]
         on_way = self.task.interpolate_few(p[rows], targets[rows], fraction)
@@ -151,40 +124,51 @@ class Follower:
             wholly: Whether all of the swings is looked at, or only the step, and none is `direct`.
         """
         motion = self.difference(q, goals)
-        # all that is between two neighbouring points is less than ε: there are no gaps to look into
-        aim = self._aim(q, motion, 1.0, math.inf if wholly else 0.0)._replace(length=np.full(len(q), np.inf))
+        aim = self._aim(q, motion, self.share(motion), math.inf if wholly else 0.0)
+        # no gap of ε or more is looked into
+        aim = aim._replace(length=np.full(len(q), np.inf))
         guesses = (q[:, None] + aim.fractions[..., None] * motion[:, None])[aim.looked]
         position, rotation = self.robot.forward_kinematics(torch.from_numpy(guesses))
         points = self.task.at(position.T, rotation.permute(1, 2, 0)).numpy()
         found, reached = self._projected(aim, points, guesses.T)
         positions = points[: self.task.dimension].T
         reached[aim.looked] &= ((positions >= bounds[0]) & (positions <= bounds[1])).all(1)
-        return self._judge(aim, found, reached, np.full_like(p, np.nan), p, p)
+        tools = np.full((*aim.looked.shape, self.task.width), np.nan, p.dtype)
+        tools[aim.looked] = points.T
+        after = np.where(aim.near[:, None], tools[:, -1], tools[:, -2])
+        return self._judge(aim, found, reached, after, p, p)
+
+    def _arrive(self, q: Array, p: Array, guesses: Array, targets: Array, length: Array) -> Lines:
+        """`follow` for lines of joint-space lengths (B,) that all end within a step: nothing is on the way."""
+        solved, reached = self.solved(targets.T, guesses.T)
+        ends = solved.T
+        steps, gaps = self.limited(q, ends), self.distance(q, ends)
+        hits, struck = self.hits(ends[:, None], reached[:, None], q, steps, reached)
+        safe, hit = reached & ~struck, hits[:, 0]
+        direct = safe & ~hit & (gaps < np.where(length <= _BRIDGED, _WIDEST, 1.0) * self.epsilon)
+        wide = direct & (gaps >= self.epsilon)
+        if some(wide):
+            direct &= self._bridged(np.stack([q, ends], axis=1), np.stack([p, targets], axis=1), wide[:, None])
+        return Lines(ends, steps, targets, reached, hit | ~reached, safe, direct)
 
     def _projected(self, aim: _Aim, points: Array, guesses: Array) -> tuple[Array, Mask]:
         """Configurations (B, K + 1, n) at the points (width, M) looked at, and which meet these (B, K + 1).
 
         What is not looked at on the way does no harm: it stands where the line ends.
         """
-        if guesses.shape[1] <= FEW:
-            solved, valid = project_few(self.robot, self.task, self.tolerances, points, guesses)
-        else:
-            columns = torch.from_numpy(points), torch.from_numpy(guesses)
-            pair = project_columns(self.robot, self.task, *columns, self.tolerances, check_collision=False)
-            solved, valid = (part.numpy() for part in pair)
+        solved, valid = self.solved(points, guesses)
         found = np.empty((*aim.looked.shape, self.robot.n), guesses.dtype)
         reached = np.empty(aim.looked.shape, dtype=bool)
         found[aim.looked], reached[aim.looked] = solved.T, valid
         found = np.where(aim.looked[..., None], found, found[:, -1:])
         return found, np.where(aim.looked, reached, reached[:, -1:])
 
-    def _aim(self, q: Array, motion: Array, pace: Array | float, most: float) -> _Aim:
+    def _aim(self, q: Array, motion: Array, share: Array, most: float) -> _Aim:
         """Which points on lines with motions (B, n) are looked at: no farther than half of ε apart.
 
-        Of a line of more than `most` pieces, none on the way is.
+        A step covers `share` (B,) of them. Of a line of more than `most` pieces, none on the way is looked at.
         """
-        share = np.minimum(self.share(motion), pace)
-        near, length = share >= _SLACK, norms(motion)
+        near, length = share >= SLACK, norms(motion)
         pieces = np.maximum(np.ceil(2.0 * length / self.epsilon), 1.0)
         short = pieces <= most
         most = int(pieces[short].max()) if short.any() else 2
@@ -198,23 +182,11 @@ class Follower:
         fractions[:, -1] = 1.0
         return _Aim(q, near, length, short, fractions, looked)
 
-    def same_goal(self, first: Array, second: Array) -> Mask:
-        """(B,) points (B, width) that are next to others: whoever is on the way to the one is to the other too."""
-        return self.task.gap_of_few(first, second) <= _SAME_GOAL
-
-    def share(self, motion: Array) -> Array:
-        """(B,) how much of motions (B, n) a step covers, a little less than it could; above 1 of short ones."""
-        return _SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
-
-    def duration(self, motion: Array) -> Array:
-        """(…,) how many control steps motions (…, n) take; of equal ones, one of less motion in all is less."""
-        return (np.abs(motion) / self._longest).max(-1) + _TIE * norms(motion / self._longest)
-
     def _judge(self, aim: _Aim, found: Array, reached: Mask, after: Array, p: Array, targets: Array) -> Lines:
         """Which of the lines can be followed, by configurations (B, K + 1, n) that were reached (B, K + 1) on them."""
         q, near = aim.q, aim.near
         ends = found[:, -1]
-        steps = self._limited(q, np.where(near[:, None], ends, found[:, -2]))
+        steps = self.limited(q, np.where(near[:, None], ends, found[:, -2]))
         chain = np.concatenate([q[:, None], found[:, :-2], ends[:, None]], axis=1)
         gaps = norms(self.difference(chain[:, :-1], chain[:, 1:]))
         wide = ~(gaps < self.epsilon)
@@ -222,11 +194,11 @@ class Follower:
         whole = aim.short & stepped & reached[:, :-2].all(1) & reached[:, -1]
         whole &= (gaps < np.where(aim.length <= _BRIDGED, _WIDEST, 1.0)[:, None] * self.epsilon).all(1)
         asked = np.concatenate([whole[:, None] & aim.looked[:, :-2], reached[:, -1:]], axis=1)
-        hit, struck = self._hits(chain[:, 1:], asked, q, steps, stepped)
+        hit, struck = self.hits(chain[:, 1:], asked, q, steps, stepped)
         safe = stepped & ~struck
         direct = whole & safe & ~hit.any(1)
         bridged = direct[:, None] & wide
-        if bridged.any():
+        if some(bridged):
             stops = np.concatenate([np.zeros_like(q[:, :1]), aim.fractions[:, :-2], np.ones_like(q[:, :1])], axis=1)
             along = self.task.interpolate_few(p[:, None], targets[:, None], np.minimum(stops, 1.0)[..., None])
             direct &= self._bridged(chain, along, bridged)
@@ -246,55 +218,3 @@ class Follower:
         result = np.ones(len(chain), dtype=bool)
         result[rows[~joined.numpy()]] = False
         return result
-
-    def limited(self, q: Tensor, towards: Tensor) -> Tensor:
-        """Configurations (B, n) towards others by at most a step, continuous joints not wrapped."""
-        return torch.from_numpy(self._limited(q.numpy(), towards.numpy()))
-
-    def _limited(self, q: Array, towards: Array) -> Array:
-        motion = self.difference(q, towards)
-        share = ((1.0 - 1e-12) * self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
-        return q + np.minimum(share, 1.0)[:, None] * motion
-
-    def difference(self, start: Array, end: Array) -> Array:
-        """`configuration.difference` of arrays."""
-        motion = end - start
-        per_turn, turn = self._turns
-        return motion - turn * np.round(motion * per_turn)
-
-    def _hits(self, alone: Array, asked: Mask, q: Array, ends: Array, on_way: Mask) -> tuple[Mask, Mask]:
-        """Self-collisions of configurations, and of arms on the way from `q` (B, n) to `ends` (B, n).
-
-        Args:
-            alone: (B, K, n) configurations.
-            asked: (B, K) which of them are asked for; the others count as free.
-            q: (B, n) where arms are.
-            ends: (B, n) where they go.
-            on_way: (B,) whose ways are asked for; the others count as struck.
-
-        Returns:
-            (B, K) configurations in self-collision, and (B,) ways that touch any.
-        """
-        fractions = (np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS).astype(q.dtype)
-        between = q[on_way, None] + fractions * (ends - q)[on_way, None]
-        every = np.concatenate([alone[asked], between.reshape(-1, q.shape[1])])
-        collides = self.robot.columns_in_self_collision(torch.from_numpy(np.ascontiguousarray(every.T))).numpy()
-        hit, struck = np.zeros(asked.shape, dtype=bool), np.ones(len(q), dtype=bool)
-        count = len(every) - between.shape[0] * SUBSTEPS
-        hit[asked] = collides[:count]
-        struck[on_way] = collides[count:].reshape(-1, SUBSTEPS).any(1)
-        return hit, struck
-
-    def distance(self, start: Array, end: Array) -> Array:
-        """D_q (…,) of arrays."""
-        return norms(self.difference(start, end))
-
-    @cached_property
-    def _longest(self) -> Array:
-        return self.longest.numpy()
-
-    @cached_property
-    def _turns(self) -> tuple[Array, Array]:
-        """1 / 2π and 2π of continuous joints, (n,) each; 0 of others, whose differences stay as they are."""
-        continuous = self.robot.continuous.numpy().astype(self._longest.dtype)
-        return continuous / (2.0 * math.pi), continuous * (2.0 * math.pi)

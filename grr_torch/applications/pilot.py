@@ -10,19 +10,17 @@ import torch
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.detours import Detours
 from grr_torch.applications.hold import much_nearer, nearest_feasible
-from grr_torch.applications.lines import Follower, Lines
+from grr_torch.applications.lines import Follower
 from grr_torch.applications.pursuit import Pursuit
 from grr_torch.applications.rejoin import rejoin
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
-from grr_torch.applications.steps import DETOURING, HOLDING, TRACKING, UNREACHABLE, Steps
-from grr_torch.pieces import Array, Mask, norms
+from grr_torch.applications.steps import DETOURING, HOLDING, TRACKING, Steps
+from grr_torch.applications.straight import Straight
+from grr_torch.pieces import Array, Mask, norms, some
 
 # vertices that are tried as a way back to the map
 _WAYS_BACK = 32
-# a configuration so near the guess that led to it [rad] is on the map; less than what the solver calls off it. Where it
-# is farther, the arm is near full stretch, where it goes slowly: so much joint motion brings little
-_NEAR = 0.3
 # steps in which an arm goes to a new point to hold at: searches that look far and closely find one in four, or two
 _GRADUALLY = 4
 # steps for which an arm waits before it turns round for a target that is next to it
@@ -54,15 +52,40 @@ class Pilot:
 
     def __init__(self, follower: Follower, solver: Solver, routes: Routes, pursuit: Pursuit) -> None:
         self.follower, self.solver, self.pursuit = follower, solver, pursuit
+        self.straight = Straight(follower, solver)
         self.detours = Detours(follower, solver, routes)
 
     def steps(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """The next step of some arms (A,) that are given targets (A, width).
 
+        An arm that has just gone straight to its target is likely to do so again: what others have to look at is left
+        out until it cannot.
+        """
+        aims, steps = self.pursuit.aims(arms, which, targets), Steps.none_yet(arms, which)
+        arms.turn = not arms.turn
+        rest = ~(arms.tracks[which] & arms.on_task[which])
+        if not rest.all():
+            rows = (~rest).nonzero()[0]
+            made, direct = self.straight.track(arms, which[rows], aims[rows])
+            steps.put(rows, made)
+            rest[rows] = ~direct
+        if some(rest):
+            rows = rest.nonzero()[0]
+            arms.tracks[which[rows]] = False
+            steps.put(rows, self._decided(arms, which[rows], aims[rows]))
+            arms.tracks[which[rows]] = steps.codes[rows] == TRACKING
+        ahead = (arms.meeting(which) & (steps.codes != HOLDING)).nonzero()[0]
+        if len(ahead):
+            near = self.follower.same_goal(arms.p[which[ahead]], targets[ahead])
+            steps.codes[ahead[~near]] = DETOURING
+        return steps
+
+    def _decided(self, arms: Arms, which: Array, targets: Array) -> Steps:
+        """Steps of arms (A,) to targets (A, width), whatever they are about.
+
         Steps that take long take turns with others. On a route, one that looks for a straight way comes after one that
         only follows the route; and points to hold at are searched for in every other step, of all arms at once.
         """
-        asked, targets = targets, self.pursuit.aims(arms, which, targets)
         on_route = arms.detours(which) & arms.on_task[which]
         blind = on_route & (arms.blind[which] > 0)
         if blind.any():
@@ -77,10 +100,6 @@ class Pilot:
         while looks.any() or on_way.any():
             looks = self._lead(round_, self._look(round_, looks), on_way, wanted)
             on_way = np.zeros_like(on_way)
-        ahead = (arms.meeting(which) & (steps.codes != HOLDING)).nonzero()[0]
-        if len(ahead):
-            near = self.follower.same_goal(arms.p[which[ahead]], asked[ahead])
-            steps.codes[ahead[~near]] = DETOURING
         return steps
 
     def _search(self, arms: Arms, which: Array, targets: Array, holding: Mask) -> Mask:
@@ -92,7 +111,6 @@ class Pilot:
         Returns:
             (A,) the arms for which that was due in this step; some of them wait.
         """
-        arms.turn = not arms.turn
         if not holding.any():
             arms.waited[which] = False
             return holding
@@ -118,14 +136,14 @@ class Pilot:
             return routed
         arms, which, targets = round_.arms, round_.which[rows], round_.targets[rows]
         lost = arms.holds(which) & ~arms.solvable[which]
-        made, found, valid, direct = self._straight(arms, which, targets, lost)
+        made, found, valid, direct = self.straight.steps(arms, which, targets, lost)
         arms.searched[which] = False
         arms.forget(which[direct & ~lost])
         fresh = (~valid & ~lost).nonzero()[0]
         if len(fresh):
             self._hold(arms, which[fresh], targets[fresh])
             every = np.ones(len(fresh), dtype=bool)
-            again, found[fresh], _, direct[fresh] = self._straight(arms, which[fresh], targets[fresh], every)
+            again, found[fresh], _, direct[fresh] = self.straight.steps(arms, which[fresh], targets[fresh], every)
             made.put(fresh, again)
         arms.end_detour(which[direct])
         away = ~direct & ~self._hesitate(arms, which, targets, valid & ~direct, made)
@@ -137,16 +155,16 @@ class Pilot:
             chosen, goals = which[away], np.where(valid[:, None], targets, arms.held[which])[away]
             self.detours.set_goals(arms, chosen, goals)
             arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[away]
-            on_swing = self._swing(round_, rows[away], found[away], wholly=True)
+            on_swing = self._swing(round_, rows[away], found[away])
             routed[rows[away][on_swing]] = False
             others = ~on_swing
             self.detours.set_last_vertices(arms, chosen[others], goals[others], found[away][others])
         return routed
 
-    def _swing(self, round_: _Round, rows: Array, goals_q: Array, *, wholly: bool) -> Mask:
+    def _swing(self, round_: _Round, rows: Array, goals_q: Array) -> Mask:
         """Sets the steps of arms, by their rows, that are free to swing to configurations (R, n): (R,)."""
-        steps, free = self.detours.swing(round_.arms, round_.which[rows], goals_q, wholly=wholly)
-        round_.steps.q[rows[free]] = steps[free]
+        steps, points, free = self.detours.swing(round_.arms, round_.which[rows], goals_q)
+        round_.steps.q[rows[free]], round_.steps.points[rows[free]] = steps[free], points[free]
         return free
 
     def _hesitate(self, arms: Arms, which: Array, targets: Array, turned: Mask, steps: Steps) -> Mask:
@@ -162,70 +180,6 @@ class Pilot:
         arms.hesitated[which[waits]] += 1
         steps.points[waits], steps.codes[waits] = arms.p[which[waits]], HOLDING
         return waits
-
-    def _straight(self, arms: Arms, which: Array, targets: Array, lost: Mask) -> tuple[Steps, Array, Mask, Mask]:
-        """Steps straight to targets (A, width), or to where those arms hold that are `lost` (A,).
-
-        Returns:
-            The steps; configurations (A, n) where they lead; which targets (A,) the map has a configuration for; and
-            which arms (A,) can go straight.
-        """
-        steps = Steps.none_yet(arms, which)
-        ends, known = np.full_like(steps.q, np.nan), lost.copy()
-        ends[lost] = arms.held_q[which[lost]]
-        rows = (~lost).nonzero()[0]
-        if len(rows):
-            points = torch.from_numpy(targets[rows].astype(np.float64))
-            guesses, codes = (part.numpy() for part in self.solver.guess(points, certified=False))
-            ends[rows], known[rows] = guesses, codes <= 1
-        valid, direct = np.zeros_like(lost), self._rests(arms, which, lost)
-        steps.points[direct], steps.codes[direct] = arms.p[which[direct]], UNREACHABLE
-        rows = (known & ~direct).nonzero()[0]
-        if len(rows):
-            chosen, holding = which[rows], lost[rows]
-            goals = np.where(holding[:, None], arms.held[chosen], targets[rows])
-            lines, found = self._lines(arms, chosen, goals, ends[rows], holding)
-            free = (found | holding) & lines.direct & arms.on_task[chosen]
-            direct[rows], valid[rows] = free, found & (free | ~self.follower.same_goal(goals, arms.barred[chosen]))
-            ends[rows[~holding]] = lines.ends[~holding]
-            steps.q[rows[free]], steps.goals[rows[free]] = lines.steps[free], lines.ends[free]
-            steps.points[rows[free]] = lines.points[free]
-            steps.codes[rows[free]] = np.where(holding, UNREACHABLE, TRACKING)[free]
-        return steps, ends, valid, direct
-
-    def _rests(self, arms: Arms, which: Array, lost: Mask) -> Mask:
-        """Which of the arms (A,) that are `lost` (A,) stand where they hold, and stay.
-
-        Whatever the map's configuration there is now: near full stretch many are within the tolerance.
-        """
-        if not lost.any():
-            return np.zeros_like(lost)
-        there = self.follower.task.gap_of_few(arms.held[which], arms.p[which]) <= self.follower.tolerances.position
-        there &= self.follower.distance(arms.q[which], arms.held_q[which]) <= _NEAR
-        return lost & there & arms.on_task[which]
-
-    def _lines(self, arms: Arms, which: Array, goals: Array, guesses: Array, lost: Mask) -> tuple[Lines, Mask]:
-        """Lines to goals (A, width), and which of these the map has a configuration for (A,), by its guesses (A, n).
-
-        Arms that are `lost` (A,) go to where they hold, in as many steps as are left for that.
-        """
-        same = ~lost & self.follower.same_goal(goals, arms.offset_at[which])
-        offsets = np.where(same[:, None], arms.offsets[which], 0.0)
-        pace = np.where(lost, 1.0 / arms.due[which], 1.0)
-        arms.due[which] = np.maximum(arms.due[which] - 1, 1)
-        stretched = (norms(offsets) > _NEAR).nonzero()[0]
-        if len(stretched):
-            motion = self.follower.difference(arms.q[which[stretched]], guesses[stretched])
-            pace[stretched] = self.follower.share(motion)
-        lines = self.follower.follow(arms.q[which], arms.p[which], guesses, goals, offsets, pace)
-        offsets = self.follower.difference(guesses, lines.ends)
-        found = ~lost & lines.converged & ~lines.collides
-        far = found & ~(norms(offsets) <= _NEAR)
-        if far.any():
-            both = (torch.from_numpy(part[far]) for part in (lines.ends, guesses))
-            found[far] = self.solver.on_map(*both).numpy()
-        arms.offsets[which], arms.offset_at[which] = np.where(found[:, None], offsets, 0.0), goals
-        return lines, found
 
     def _hold(self, arms: Arms, which: Array, targets: Array) -> None:
         """Looks for the nearest points to targets (A, width) that arms can hold at, and whether these are solvable."""
@@ -251,7 +205,7 @@ class Pilot:
         swinging = on_way & arms.swings(which)
         rows = swinging.nonzero()[0]
         if len(rows):
-            left[rows] = ~self._swing(round_, rows, arms.swing[which[rows]], wholly=False)
+            left[rows] = ~self._swing(round_, rows, arms.swing[which[rows]])
         rows = (routed & arms.on_task[which] | on_way & ~swinging).nonzero()[0]
         if len(rows):
             chosen = which[rows]

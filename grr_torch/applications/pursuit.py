@@ -10,7 +10,7 @@ import torch
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.solve import Solver
-from grr_torch.pieces import Array, Mask, norms
+from grr_torch.pieces import Array, Mask, norms, some
 
 # control steps that are looked ahead at most
 _FARTHEST = 1_000_000
@@ -64,7 +64,7 @@ class Pursuit:
         self._watch(arms, which, targets)
         behind = arms.meeting(which)
         due = behind | arms.holds(which) & ~arms.solvable[which]
-        if not due.any():
+        if not some(due):
             arms.looks_in[which] = 0
             return targets
         moves = norms(arms.velocity[which]) > _REST / self.rate
@@ -92,18 +92,18 @@ class Pursuit:
         d, passed = self.follower.task.dimension, arms.unchanged[which]
         motion = (targets - arms.given[which])[:, :d] / passed[:, None]
         length, velocity = norms(motion), arms.velocity[which]
-        stale = passed > _STALE * self.rate
+        stale, rests = passed > _STALE * self.rate, length == 0.0
         # comparison with NaN, where there was no target yet, is false
-        steady = (length <= _LEAP / self.rate) & ~stale
-        moved = ~(length == 0.0)
+        goes_on = (length <= _LEAP / self.rate) & ~stale & ~rests
         straight = (motion * velocity).sum(1) > _STRAIGHT * length * norms(velocity)
         share = -np.expm1(-passed / (_MEAN * self.rate))
-        velocity = np.where((moved & steady)[:, None], velocity + share[:, None] * (motion - velocity), velocity)
-        velocity[moved & ~steady | ~moved & stale] = 0.0
-        arms.velocity[which] = velocity
-        arms.going[which] = np.where(moved & ~(steady & straight), 0, arms.going[which] + 1)
+        mean = velocity + share[:, None] * (motion - velocity)
+        if not goes_on.all():
+            mean = np.where(goes_on[:, None], mean, np.where((rests & ~stale)[:, None], velocity, 0.0))
+        arms.velocity[which] = mean
+        arms.going[which] = np.where(rests | goes_on & straight, arms.going[which] + 1, 0)
         arms.given[which] = targets
-        arms.unchanged[which[moved]] = 0
+        arms.unchanged[which[~rests]] = 0
 
     def _look(self, arms: Arms, which: Array, targets: Array, behind: Mask) -> None:
         """Looks for where arms (A,) meet targets (A, width); those that are not `behind` (A,) may wait."""

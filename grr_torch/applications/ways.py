@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from grr_torch.applications.lines import SUBSTEPS
+from grr_torch.applications.motions import SUBSTEPS
 from grr_torch.applications.solve import Solver
 from grr_torch.projection.project import project_columns, tool_points
 from grr_torch.spaces.configuration import difference, distance, interpolate

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from scipy.linalg.lapack import dposv
 from torch import Tensor
+
+from grr_torch.pieces import Array
 
 # up to so many columns torch.linalg's own routines are faster
 _FEW = 16
+# and those up to which, on the CPU, numpy's are, and up to which it is as fast to call LAPACK for each
+_LAPACK, _ONE_BY_ONE = 64, 6
 
 
 def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Tensor:
@@ -20,6 +26,10 @@ def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Te
         damping: (N,) λ > 0.
     """
     if jacobian.shape[2] <= _FEW:
+        tracked = torch.is_grad_enabled() and (jacobian.requires_grad or error.requires_grad)
+        if jacobian.device.type == "cpu" and jacobian.dtype == torch.float64 and not tracked:
+            arrays = (tensor.detach().numpy() for tensor in (jacobian, error, damping))
+            return torch.from_numpy(damped_least_squares_of_few(*arrays))
         rows = jacobian.permute(2, 0, 1)
         normal = rows @ rows.mT
         normal.diagonal(dim1=1, dim2=2).add_(damping[:, None])
@@ -36,6 +46,24 @@ def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Te
     normal.diagonal(dim1=0, dim2=1).add_(damping[:, None])
     right.copy_(error[:, None])
     return transposed_product(jacobian, _eliminate(block, m)[:, 0])
+
+
+def damped_least_squares_of_few(jacobian: Array, error: Array, damping: Array) -> Array:
+    """`damped_least_squares` for arrays, by LAPACK where they are few."""
+    # in single precision the damping may be lost, and one singular column would make LAPACK give up all
+    if jacobian.shape[2] > _LAPACK or jacobian.dtype != np.float64:
+        return damped_least_squares(*(torch.from_numpy(array) for array in (jacobian, error, damping))).numpy()
+    rows = jacobian.transpose(2, 0, 1)
+    columns = rows.transpose(0, 2, 1)
+    normal = rows @ columns
+    normal.reshape(len(rows), len(error) ** 2)[:, :: len(error) + 1] += damping[:, None]
+    if len(rows) <= _ONE_BY_ONE:
+        step = np.empty(jacobian.shape[1:])
+        for k, (system, transposed) in enumerate(zip(normal, columns, strict=True)):
+            solved = dposv(system.T, error[:, k])[1]
+            step[:, k] = transposed @ solved
+        return step
+    return (columns @ np.linalg.solve(normal, error.T[..., None]))[..., 0].T
 
 
 def null_space_projector(jacobian: Tensor, damping: float) -> Tensor:

@@ -9,10 +9,9 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
-from grr_torch.pieces import Array, Mask
-from grr_torch.projection.columns import damped_least_squares
+from grr_torch.pieces import Array, Mask, some
+from grr_torch.projection.columns import damped_least_squares_of_few
 from grr_torch.projection.step import (
     DAMPING,
     FALLEN,
@@ -25,9 +24,6 @@ from grr_torch.projection.step import (
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace
 
-# columns up to which LAPACK's solver is faster
-_LAPACK = 64
-
 if TYPE_CHECKING:
     from grr_torch.projection.project import Tolerances
 
@@ -37,7 +33,7 @@ if TYPE_CHECKING:
 def project_few(robot: Robot, task: TaskSpace, tolerances: Tolerances, targets: Array, q: Array) -> tuple[Array, Mask]:
     """Configurations (n, N), NaN where not converged, and converged (N,), for points (width, N) and guesses (n, N)."""
     few, rows = robot.tree.few, task.dimension
-    limits = (robot.lower.numpy()[:, None], robot.upper.numpy()[:, None]) if robot.has_limits else None
+    limits = robot.limits_of_few
     solved, valid = np.full(q.shape, np.nan, q.dtype), np.zeros(q.shape[1], dtype=bool)
     now = q if limits is None else _clamped(q, limits)
     rank = np.arange(q.shape[1])
@@ -54,9 +50,10 @@ def project_few(robot: Robot, task: TaskSpace, tolerances: Tolerances, targets: 
         if (iteration + 1) % PATIENCE == 0:
             kept &= best < FALLEN * before
             before = best
-        if not kept.all():
+        left = np.count_nonzero(kept)
+        if left < len(kept):
             solved[:, rank[done]], valid[rank[done]] = now[:, done], True
-            if not kept.any():
+            if left == 0:
                 break
             rank, best, before, size, now = rank[kept], best[kept], before[kept], size[kept], now[:, kept]
             error, frames, targets = error[:, kept], frames[..., kept], targets[:, kept]
@@ -64,15 +61,14 @@ def project_few(robot: Robot, task: TaskSpace, tolerances: Tolerances, targets: 
         jacobian[rows:] *= ROTATION_LENGTH
         error[rows:] *= ROTATION_LENGTH
         now = _step(limits, now, jacobian, error, 0.5 * DAMPING * size + LEAST_DAMPING)
-    turns = np.round(solved * (0.5 / math.pi)) * robot.continuous.numpy()[:, None]
-    return solved - (2.0 * math.pi) * turns, valid
+    return solved - robot.turns_of_few * np.rint(solved * (0.5 / math.pi)), valid
 
 
 def _step(limits: tuple[Array, Array] | None, q: Array, jacobian: Array, error: Array, damping: Array) -> Array:
     """Configurations (n, M) after a step within limits: `free_step`, and `stop_at_limits` where one is met."""
-    step = _damped_least_squares(jacobian, error, damping)
+    step = damped_least_squares_of_few(jacobian, error, damping)
     longest = np.abs(step).max(0)
-    if (longest < SHORTEST_STEP).any():
+    if some(longest < SHORTEST_STEP):
         # at a stationary point, such as a straight arm, any direction may lead on
         nudge = 0.05 * np.cos(np.arange(1, len(step) + 1, dtype=step.dtype))[:, None]
         step = np.where(longest < SHORTEST_STEP, nudge, step)
@@ -80,8 +76,9 @@ def _step(limits: tuple[Array, Array] | None, q: Array, jacobian: Array, error: 
     if limits is None:
         return moved
     kept = _clamped(moved, limits)
-    stopped = (kept != moved).any(0).nonzero()[0]
-    if len(stopped):
+    beyond = kept != moved
+    if some(beyond):
+        stopped = beyond.any(0).nonzero()[0]
         equations = q[:, stopped], jacobian[..., stopped], error[:, stopped], damping[stopped]
         kept[:, stopped] = _stop_at_limits(limits, *equations, moved[:, stopped])
     return kept
@@ -101,7 +98,7 @@ def _stop_at_limits(
     for _ in range(len(q)):
         held = np.where(stopped, kept - q, 0.0).astype(q.dtype)
         rest = error - (jacobian * held).sum(1)
-        step = held + _damped_least_squares(jacobian * ~stopped, rest, damping)
+        step = held + damped_least_squares_of_few(jacobian * ~stopped, rest, damping)
         moved = q + step * (LONGEST_STEP / np.maximum(np.abs(step).max(0), LONGEST_STEP))
         kept = _clamped(moved, limits)
         beyond = (kept != moved) & ~stopped
@@ -109,16 +106,3 @@ def _stop_at_limits(
             break
         stopped |= beyond
     return kept
-
-
-def _damped_least_squares(jacobian: Array, error: Array, damping: Array) -> Array:
-    """`columns.damped_least_squares`: steps (n, M); LAPACK, one call for all, is faster for very few."""
-    # in single precision the damping may be lost, and one singular column would make LAPACK give up all
-    if jacobian.shape[2] > _LAPACK or jacobian.dtype != np.float64:
-        return damped_least_squares(*(torch.from_numpy(array) for array in (jacobian, error, damping))).numpy()
-    rows = jacobian.transpose(2, 0, 1)
-    columns = rows.transpose(0, 2, 1)
-    normal = rows @ columns
-    diagonal = np.arange(len(error))
-    normal[:, diagonal, diagonal] += damping[:, None]
-    return (columns @ np.linalg.solve(normal, error.T[..., None]))[..., 0].T

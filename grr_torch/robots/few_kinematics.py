@@ -16,13 +16,18 @@ if TYPE_CHECKING:
     from grr_torch.robots.kinematics import KinematicTree
 
 
+# of x, y, z the next one and the one before, for cross products
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+
+
 class FewKinematics:
     """Constants of a kinematic tree, and what is computed with them."""
 
     def __init__(self, tree: KinematicTree) -> None:
         self._joints = tree.joints
         self._parents = [joint.parent for joint in tree.joints]
-        self._dofs = np.array([joint.dof for joint in tree.joints], dtype=np.int64)
+        dofs = [joint.dof for joint in tree.joints]
+        self._dofs = None if dofs == list(range(tree.n)) else np.array(dofs, dtype=np.int64)
         mounts = [mount.numpy() for mount in tree.mounts]
         # what cos q, sin q, 1 and q make of a joint's frame in its parent's
         self._terms = np.stack(
@@ -48,14 +53,14 @@ class FewKinematics:
 
     def frames(self, q: Array) -> Array:
         """`KinematicTree.frames`: poses (F, 4, 3, N) for configurations q (n, N)."""
-        values = q[self._dofs]
+        values = q if self._dofs is None else q[self._dofs]
         if self._mimic is not None:
             values = (values * self._mimic[0] + self._mimic[1]).astype(q.dtype)
         count, width = values.shape
-        factors = np.ones((count, width, 4), q.dtype)
+        factors = np.empty((count, width, 4), q.dtype)
         np.cos(values, out=factors[..., 0])
         np.sin(values, out=factors[..., 1])
-        factors[..., 3] = values
+        factors[..., 2], factors[..., 3] = 1.0, values
         local = np.matmul(factors, self._terms).reshape(count, width, 4, 4)
         frames = np.empty((count + 2, width, 4, 3), q.dtype)
         frames[-1] = self._base
@@ -67,13 +72,10 @@ class FewKinematics:
     def jacobian(self, frames: Array) -> Array:
         """`KinematicTree.jacobian`: (6, n, N) from frames (F, 4, 3, N)."""
         lines = frames[: len(self._path)] if self._drive is None else frames[self._path]
-        ax, ay, az = lines[:, 2].transpose(1, 0, 2)
-        rx, ry, rz = (frames[-2, 3] - lines[:, 3]).transpose(1, 0, 2)
-        rows = np.empty((6, *ax.shape), frames.dtype)
-        np.subtract(ay * rz, az * ry, out=rows[0])
-        np.subtract(az * rx, ax * rz, out=rows[1])
-        np.subtract(ax * ry, ay * rx, out=rows[2])
-        rows[3:] = lines[:, 2].transpose(1, 0, 2)
+        axes, reach = lines[:, 2].transpose(1, 0, 2), (frames[-2, 3] - lines[:, 3]).transpose(1, 0, 2)
+        rows = np.empty((6, *axes.shape[1:]), frames.dtype)
+        np.subtract(axes[_NEXT] * reach[_LAST], axes[_LAST] * reach[_NEXT], out=rows[:3])
+        rows[3:] = axes
         if self._slides:
             slides = [k for k, index in enumerate(self._path) if index in self._slides]
             rows[:3, slides] = rows[3:, slides]

@@ -49,11 +49,11 @@ class FewSpheres:
         poses = frames[self._frames]
         bounds = _place(self._bounds, poses)[:, 0]
         apart = bounds[self._first] - bounds[self._second]
-        near = ~((apart * apart).sum(1) >= np.square(self._bound_reach + margin))
+        near = ~(np.einsum("pkn,pkn->pn", apart, apart) >= np.square(self._bound_reach + margin))
+        if np.count_nonzero(near) == 0:
+            return np.zeros(near.shape[1], dtype=bool)
         hit = near.any(0)
         some = hit.nonzero()[0]
-        if len(some) == 0:
-            return hit
         hit[some] = False
         placed = _place(self._centres, poses[..., some])
         pairs, columns = near[:, some].nonzero()

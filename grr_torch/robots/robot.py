@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import are_few, in_pieces, piece
+from grr_torch.pieces import FEW, Array, Mask, are_few, in_pieces, piece
 from grr_torch.robots.chain import serial_chain
 from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.presets import Preset
@@ -86,6 +86,16 @@ class Robot:
     def has_limits(self) -> bool:
         """Whether any joint has position limits."""
         return not bool(self.lower.isinf().all() & self.upper.isinf().all())
+
+    @cached_property
+    def limits_of_few(self) -> tuple[Array, Array] | None:
+        """Arrays (n, 1) of the joint limits, for few configurations on the CPU; None where no joint has any."""
+        return (self.lower.numpy()[:, None], self.upper.numpy()[:, None]) if self.has_limits else None
+
+    @cached_property
+    def turns_of_few(self) -> Array:
+        """(n, 1) a whole turn of continuous joints, 0 of others."""
+        return 2.0 * math.pi * self.continuous.numpy()[:, None].astype(self.lower.numpy().dtype)
 
     @cached_property
     def chain(self) -> SerialChain:
@@ -262,6 +272,13 @@ class Robot:
         if kernel is None:
             return torch.zeros(columns.shape[1], dtype=torch.bool, device=columns.device)
         return self._of_frames(lambda frames: (kernel.collides(frames, self.margin),), columns)[0]
+
+    def few_in_self_collision(self, columns: Array) -> Mask:
+        """`columns_in_self_collision` for arrays; on the CPU, no tensors are made of a few."""
+        kernel = self._sphere_kernel
+        if kernel is None or columns.shape[1] > min(FEW, kernel.most_of_few):
+            return self.columns_in_self_collision(torch.from_numpy(columns)).numpy()
+        return kernel.few.collides(self.tree.few.frames(columns), self.margin)
 
     def _tool_pose(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """`KinematicTree.tool_pose` in memory of its own, so that what is kept does not keep all frames."""

@@ -124,8 +124,8 @@ class SphereKernel:
 
     def collides(self, frames: Tensor, margin: float) -> Tensor:
         """Whether any checked pair of links is nearer than `margin` [m]: (N,) bool; true where a frame is NaN."""
-        if frames.device.type == "cpu" and frames.shape[3] <= self._most_of_few:
-            return torch.from_numpy(self._few.collides(frames.detach().numpy(), margin))
+        if frames.device.type == "cpu" and frames.shape[3] <= self.most_of_few:
+            return torch.from_numpy(self.few.collides(frames.detach().numpy(), margin))
         hit = torch.zeros(frames.shape[3], dtype=torch.bool, device=frames.device)
         for _, columns, touching in self._touching(frames, margin):
             hit[columns] |= touching
@@ -149,14 +149,15 @@ class SphereKernel:
                 yield index, chosen[part], ~(squared >= limit).flatten(0, 1).all(0)
 
     @cached_property
-    def _most_of_few(self) -> int:
+    def most_of_few(self) -> int:
         """Configurations up to which all spheres are placed by numpy."""
         pairs = sum(pair.reach.numel() for pair in self.spheres)
         filled = len(self.spheres) * max(max(pair.reach.shape[:2]) for pair in self.spheres) ** 2
         return _PAIRS_OF_FEW // filled if filled <= _FILLED * pairs else 0
 
     @cached_property
-    def _few(self) -> FewSpheres:
+    def few(self) -> FewSpheres:
+        """For a few configurations on the CPU."""
         return FewSpheres(self)
 
     def _squared(self, frames: Tensor, points: Tensor) -> Tensor:

@@ -59,6 +59,7 @@ def average(sums: Tensor, continuous: Tensor) -> Tensor:
 
 def average_of_few(sums: Array, continuous: Array) -> Array:
     """`average` for arrays."""
-    first, second = np.split(sums, 2, axis=-1)
+    n = sums.shape[-1] // 2
+    first, second = sums[..., :n], sums[..., n:]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(continuous, np.arctan2(second, first), first / second)

@@ -8,13 +8,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import Array
+from grr_torch.pieces import Array, some
 
 # below any sine of an angle that is not 0, and above what a division makes infinite
 _TINY = 1e-30
 # how far from −1 cosines are of angles to which the axis may have to be found otherwise, and sines of such angles
 _HALF_TURN = 1e-12
 _STRAIGHT = 1e-7
+# cosines below which that is so, by precision
+_FLIPPED = {
+    np.dtype(kind): -1.0 + max(_HALF_TURN, 8.0 * float(np.finfo(kind).eps)) for kind in (np.float64, np.float32)
+}
 
 
 def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Tensor:
@@ -122,7 +126,7 @@ def rotation_error_of_few(target: Array, terms: Array, rotation: Array) -> Array
     """`rotation_error` for arrays, of one target (3, 3) with its `turning_terms`: a fifth of its time."""
     mixed = terms.astype(rotation.dtype, copy=False) @ rotation.transpose(1, 0, 2).reshape(9, -1)
     twisted, cosine = mixed[:3], mixed[3] - 0.5
-    if cosine.min(initial=1.0) < -1.0 + max(_HALF_TURN, 8.0 * float(np.finfo(rotation.dtype).eps)):
+    if some(cosine < _FLIPPED[rotation.dtype]):
         tensors = torch.from_numpy(target).to(torch.from_numpy(rotation))[..., None], torch.from_numpy(rotation)
         return rotation_error(*tensors).numpy()
     sine = np.sqrt((twisted * twisted).sum(0)) + _TINY

@@ -1,0 +1,126 @@
+"""Joint motions of a few arms: how long they take, where they end, and whether they are free of self-collision."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from grr_torch.pieces import FEW, Array, Mask, norms, some
+from grr_torch.projection.few import project_few
+from grr_torch.projection.project import Tolerances, project_columns
+from grr_torch.robots.robot import Robot
+from grr_torch.spaces.task import TaskSpace
+
+# configurations between two steps at which self-collision is checked, the second step's own included
+SUBSTEPS = 8
+# points no farther apart than this [m] are the same goal
+_SAME_GOAL = 0.03
+# of the longest step, so that what the projection adds seldom has to be cut off
+SLACK = 0.98
+# what the length of a motion counts beside the steps that its slowest joint takes
+_TIE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Motions of arms in steps of limited length.
+
+    Works on arrays: of so few numbers a call of numpy takes a third of the time of torch's.
+
+    Attributes:
+        robot: The robot.
+        task: The task space.
+        tolerances: When a configuration counts as being at a point.
+        longest: (n,) the most that a joint moves in a control step [rad or m].
+    """
+
+    robot: Robot
+    task: TaskSpace
+    tolerances: Tolerances
+    longest: Tensor
+
+    @property
+    def epsilon(self) -> float:
+        """ε of the continuity check: 0.05 √n [rad]."""
+        return 0.05 * math.sqrt(self.robot.n)
+
+    def same_goal(self, first: Array, second: Array) -> Mask:
+        """(B,) points (B, width) that are next to others: whoever is on the way to the one is to the other too."""
+        return self.task.gap_of_few(first, second) <= _SAME_GOAL
+
+    def share(self, motion: Array) -> Array:
+        """(B,) how much of motions (B, n) a step covers, a little less than it could; above 1 of short ones."""
+        return SLACK * (self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
+
+    def duration(self, motion: Array) -> Array:
+        """(…,) how many control steps motions (…, n) take; of equal ones, one of less motion in all is less."""
+        return (np.abs(motion) / self._longest).max(-1) + _TIE * norms(motion / self._longest)
+
+    def solved(self, points: Array, guesses: Array) -> tuple[Array, Mask]:
+        """`project_columns` for arrays, self-collision left open."""
+        if guesses.shape[1] <= FEW:
+            return project_few(self.robot, self.task, self.tolerances, points, guesses)
+        columns = torch.from_numpy(points), torch.from_numpy(guesses)
+        solved, valid = project_columns(self.robot, self.task, *columns, self.tolerances, check_collision=False)
+        return solved.numpy(), valid.numpy()
+
+    def limited(self, q: Array, towards: Array) -> Array:
+        """Configurations (B, n) towards others by at most a step, continuous joints not wrapped."""
+        motion = self.difference(q, towards)
+        share = ((1.0 - 1e-12) * self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
+        return q + np.minimum(share, 1.0)[:, None] * motion
+
+    def difference(self, start: Array, end: Array) -> Array:
+        """`configuration.difference` of arrays."""
+        motion = end - start
+        per_turn, turn = self._turns
+        return motion - turn * np.rint(motion * per_turn)
+
+    def hits(self, alone: Array, asked: Mask, q: Array, ends: Array, on_way: Mask) -> tuple[Mask, Mask]:
+        """Self-collisions of configurations, and of arms on the way from `q` (B, n) to `ends` (B, n).
+
+        Args:
+            alone: (B, K, n) configurations.
+            asked: (B, K) which of them are asked for; the others count as free.
+            q: (B, n) where arms are.
+            ends: (B, n) where they go.
+            on_way: (B,) whose ways are asked for; the others count as struck.
+
+        Returns:
+            (B, K) configurations in self-collision, and (B,) ways that touch any.
+        """
+        between = q[on_way, None] + self._substeps * (ends - q)[on_way, None]
+        every = np.concatenate([alone[asked], between.reshape(-1, q.shape[1])])
+        collides = self.robot.few_in_self_collision(np.ascontiguousarray(every.T))
+        hit, struck = np.zeros(asked.shape, dtype=bool), np.ones(len(q), dtype=bool)
+        if not some(collides):
+            struck[on_way] = False
+            return hit, struck
+        count = len(every) - between.shape[0] * SUBSTEPS
+        hit[asked] = collides[:count]
+        struck[on_way] = collides[count:].reshape(-1, SUBSTEPS).any(1)
+        return hit, struck
+
+    def distance(self, start: Array, end: Array) -> Array:
+        """D_q (…,) of arrays."""
+        return norms(self.difference(start, end))
+
+    @cached_property
+    def _longest(self) -> Array:
+        return self.longest.numpy()
+
+    @cached_property
+    def _substeps(self) -> Array:
+        """(SUBSTEPS, 1) of a step, where self-collision is checked."""
+        return (np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS).astype(self._longest.dtype)
+
+    @cached_property
+    def _turns(self) -> tuple[Array, Array]:
+        """1 / 2π and 2π of continuous joints, (n,) each; 0 of others, whose differences stay as they are."""
+        continuous = self.robot.continuous.numpy().astype(self._longest.dtype)
+        return continuous / (2.0 * math.pi), continuous * (2.0 * math.pi)
