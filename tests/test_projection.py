@@ -13,7 +13,7 @@ from random_robots import random_urdf
 
 import grr_torch
 from grr_torch.errors import ParameterError
-from grr_torch.projection.columns import damped_least_squares, solve_spd
+from grr_torch.projection.columns import damped_least_squares, damped_least_squares_of_few, solve_spd
 from grr_torch.projection.project import Tolerances, project
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.rotation import quaternion_from_matrix, rotation_error
@@ -35,16 +35,23 @@ def test_column_solver_agrees_with_torch_linalg(m, condition, generator):
     torch.testing.assert_close(found, expected, rtol=1e-14 * condition * 100, atol=1e-12 * condition)
 
 
-def test_damped_least_squares_is_the_regularised_minimum(generator):
-    jacobian = torch.randn(6, 7, 20, dtype=torch.float64, generator=generator)
-    jacobian[:, :, 0] = 0.0  # fully singular
-    jacobian[3:, :, 1] = jacobian[:3, :, 1]  # rank 3
-    error = torch.randn(6, 20, dtype=torch.float64, generator=generator)
-    damping = torch.full((20,), 1e-3, dtype=torch.float64)
-    step = damped_least_squares(jacobian, error, damping)
-    for k in range(20):
+@pytest.mark.parametrize("count", [0, 1, 2, 6, 7, 16, 20, 65])
+@pytest.mark.parametrize("solve", ["tensors", "arrays"])
+def test_damped_least_squares_is_the_regularised_minimum(generator, count, solve):
+    jacobian = torch.randn(6, 7, count, dtype=torch.float64, generator=generator)
+    jacobian[:, :, :1] = 0.0  # fully singular
+    jacobian[3:, :, 1:2] = jacobian[:3, :, 1:2]  # rank 3
+    error = torch.randn(6, count, dtype=torch.float64, generator=generator)
+    damping = torch.rand(count, dtype=torch.float64, generator=generator) + 1e-3
+    if solve == "tensors":
+        step = damped_least_squares(jacobian, error, damping)
+    else:
+        arrays = (tensor.numpy().copy() for tensor in (jacobian, error, damping))
+        step = torch.from_numpy(damped_least_squares_of_few(*arrays))
+    assert step.shape == (7, count)
+    for k in range(count):
         j, e = jacobian[:, :, k], error[:, k]
-        expected = torch.linalg.solve(j.T @ j + 1e-3 * torch.eye(7, dtype=torch.float64), j.T @ e)
+        expected = torch.linalg.solve(j.T @ j + damping[k] * torch.eye(7, dtype=torch.float64), j.T @ e)
         torch.testing.assert_close(step[:, k], expected, rtol=1e-8, atol=1e-10)
 
 

@@ -218,7 +218,7 @@ def test_a_missing_sphere_file_is_a_clear_error(tmp_path):
 
 def test_a_few_configurations_are_checked_as_many_are(kinova, generator):
     q = torch.cat([kinova.sample(2000, generator), torch.full((1, 7), torch.nan, dtype=torch.float64)])
-    assert 90 < kinova._sphere_kernel._most_of_few < len(q)
+    assert 90 < kinova._sphere_kernel.most_of_few < len(q)
     many = kinova.in_self_collision(q)
     assert 60 < int(many.sum()) < 1800
     assert torch.equal(many, torch.cat([kinova.in_self_collision(part) for part in q.split(90)]))

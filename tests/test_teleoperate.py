@@ -9,8 +9,11 @@ from teleoperated import follow_targets, some_vertices
 
 import grr_torch
 from grr_torch.applications.routes import Routes
+from grr_torch.applications.steps import Steps
+from grr_torch.applications.straight import Straight
 from grr_torch.applications.teleoperate import STATUSES, Teleoperator
 from grr_torch.errors import ParameterError
+from grr_torch.experiments.paths import draw_paths
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +143,24 @@ def test_many_arms_are_the_same_as_one_at_a_time(roadmap):
         alone = Teleoperator(roadmap, start=roadmap.configurations[vertices[arm]])
         single, _ = follow_targets(alone, targets[:8, arm])
         assert torch.allclose(single, q.reshape(40, 6, 7)[:8, arm], atol=1e-6)
+
+
+def test_arms_that_track_do_as_they_would_if_they_looked_at_everything(roadmap, monkeypatch):
+    start = roadmap.configurations[some_vertices(roadmap, 20, 5)]
+    lines = [draw_paths(roadmap, kind, 10, seed=7).transpose(0, 1) for kind in ("line_random", "circle_out")]
+    targets = torch.cat(lines, dim=1)
+    found, status = follow_targets(Teleoperator(roadmap, start=start, max_step=0.04), targets)
+
+    def never(straight, arms, which, goals):
+        return Steps.none_yet(arms, which), np.zeros(len(which), dtype=bool)
+
+    monkeypatch.setattr(Straight, "track", never)
+    expected, expected_status = follow_targets(Teleoperator(roadmap, start=start, max_step=0.04), targets)
+    assert (status == "tracking").mean() > 0.5
+    assert (status != "tracking").mean() > 0.1
+    assert (status == expected_status).all()
+    # how many are solved at once decides on the last digits
+    assert torch.allclose(found, expected, atol=1e-9)
 
 
 def test_joints_are_not_wrapped(planar_roadmap):
