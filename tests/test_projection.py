@@ -55,6 +55,18 @@ def test_damped_least_squares_is_the_regularised_minimum(generator, count, solve
         torch.testing.assert_close(step[:, k], expected, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.parametrize("count", [1, 6, 7, 20])
+def test_a_system_that_damping_does_not_mend_gives_nan_and_harms_no_other(generator, count):
+    jacobian = torch.randn(6, 7, count, dtype=torch.float64, generator=generator)
+    jacobian[:, :, 0] = 1e6  # equal rows beside which the damping is lost
+    error = torch.randn(6, count, dtype=torch.float64, generator=generator)
+    damping = torch.full((count,), 1e-7, dtype=torch.float64)
+    step = damped_least_squares_of_few(*(tensor.numpy() for tensor in (jacobian, error, damping)))
+    others = damped_least_squares(*(tensor[..., 1:] for tensor in (jacobian, error, damping)))
+    assert np.allclose(step[:, 1:], others.numpy(), rtol=1e-6, atol=1e-9)
+    assert np.isnan(step[:, 0]).all() or np.abs(step[:, 0]).max() < 1e-3
+
+
 class AnyPose(Position):
     """Poses as rows of position and rotation matrix, to project to many rotations at once."""
 

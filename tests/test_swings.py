@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from public_arms import PANDA, arm_urdf
 from teleoperated import follow_targets, some_vertices
 
 import grr_torch
@@ -106,10 +107,12 @@ def test_a_swing_does_not_leave_the_bounds(roadmap, follower, pairs):
         rises = free & (tools[..., axis].max(0) > np.maximum(p, ends)[:, axis] + 0.02)
         assert rises.any()
         for row in rises.nonzero()[0]:
-            high = np.full(p.shape[1], np.inf)
-            high[axis] = limit[row]
+            bound = np.full(p.shape[1], np.inf)
             one = slice(row, row + 1)
-            assert not _swing(roadmap, follower, q[one], p[one], goals[one], (-high * np.inf, high)).direct.any()
+            assert _swing(roadmap, follower, q[one], p[one], goals[one], (-bound, bound)).direct.all()
+            beyond = bound.copy()
+            beyond[axis] = limit[row]
+            assert not _swing(roadmap, follower, q[one], p[one], goals[one], (-bound, beyond)).direct.any()
 
 
 def test_a_goal_that_is_not_known_is_not_swung_to(roadmap, follower, pairs):
@@ -136,3 +139,52 @@ def test_an_arm_turns_on_the_spot_for_a_line_past_its_own_axis(kinova_roadmap, h
     assert float(away.max()) < 0.08
     assert (status == "detouring").any(0).all()
     assert float((tools[-1] - line[-1]).norm(dim=1).max()) < 1e-3
+
+
+def test_a_swing_that_has_arrived_is_over(kinova_roadmap):
+    """The arm does not stand at its end for a goal next to it."""
+    arms = Teleoperator(kinova_roadmap, start=kinova_roadmap.configurations[some_vertices(kinova_roadmap, 1)])
+    detours, state, which = arms._pilot.detours, arms._arms, np.arange(1)
+    for start in (state.q, state.q + 0.01):
+        state.swing[0] = start[0]
+        goal = start + 0.04
+        steps, _, free = detours.swing(state, which, goal)
+        moved = np.abs(steps - state.q).max()
+        assert not free[0] or moved > 1e-3
+
+
+@pytest.fixture(scope="module")
+def crowded(tmp_path_factory) -> grr_torch.Roadmap:
+    """Of an arm whose joint limits refuse many swings."""
+    path = tmp_path_factory.mktemp("arm") / "panda.urdf"
+    path.write_text(arm_urdf(*PANDA))
+    down = grr_torch.FixedRotation(dimension=3, rpy=(math.pi, 0.0, 0.0))
+    bounds = [(-0.7, 0.7), (-0.7, 0.7), (0.1, 0.6)]
+    return grr_torch.build(grr_torch.load_robot(path), down, points=1500, bounds=bounds, refine=False)
+
+
+def test_arms_whose_swings_are_refused_keep_to_their_routes(crowded, monkeypatch):
+    """They neither stand still for ever nor go to and fro."""
+    refused = []
+    swing = Follower.swing
+
+    def watched(*arguments, **options):
+        lines = swing(*arguments, **options)
+        refused.append(~lines.direct if options["wholly"] else ~lines.safe)
+        return lines
+
+    monkeypatch.setattr(Follower, "swing", watched)
+    generator = torch.Generator().manual_seed(2)
+    vertices = some_vertices(crowded, 30)
+    arms = Teleoperator(crowded, start=crowded.configurations[vertices], max_step=STEP)
+    for _ in range(3):
+        goals = crowded.points[vertices[torch.randperm(30, generator=generator)]]
+        q, status = follow_targets(arms, goals.expand(150, -1, -1))
+        away = (crowded.robot.forward_kinematics(q)[0] - goals).norm(dim=2)
+        still = torch.from_numpy(np.isin(status, ["detouring", "holding"]))[1:] & (away[1:] > 0.01)
+        still &= q.diff(dim=0).abs().amax(2) < 1e-6
+        assert not bool(still.unfold(0, 10, 1).all(2).any())
+        motion = q.diff(dim=0)
+        assert int(((motion[1:] * motion[:-1]).sum(2) < -1e-4).sum(0).max()) <= 30
+        assert float((away[-1] > 0.01).double().mean()) < 0.1
+    assert np.concatenate(refused).mean() > 0.1

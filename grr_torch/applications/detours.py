@@ -48,12 +48,13 @@ class Detours:
     def swing(self, arms: Arms, which: Array, goals_q: Array) -> tuple[Array, Array, Mask]:
         """Swings of arms to configurations (A, n), or next to them. No route is quicker.
 
-        One that an arm is already on has been looked at; of it only the step is.
+        One that an arm is already on has been looked at; of it only the step is. One that is not free is over.
 
         Returns:
             Steps (A, n), the points (A, width) where tools are after them, and which swings (A,) are free.
         """
         under_way = self.follower.distance(arms.swing[which], goals_q) < self.follower.epsilon
+        under_way &= self.follower.distance(arms.q[which], arms.swing[which]) >= _ARRIVED
         ends = np.where(under_way[:, None], arms.swing[which], goals_q)
         steps, points, free = arms.q[which], arms.p[which], np.zeros_like(under_way)
         for wholly, rows in ((False, under_way.nonzero()[0]), (True, (~under_way).nonzero()[0])):
@@ -62,8 +63,9 @@ class Detours:
                 lines = self.follower.swing(*placed, ends[rows], self.solver.bounds, wholly=wholly)
                 steps[rows], points[rows] = lines.steps, lines.points
                 free[rows] = lines.direct if wholly else lines.safe
-        arms.end_detour(which)
-        arms.swing[which[free]] = ends[free]
+        # a route is left for a swing that is free, not for one that is refused
+        arms.swing[which] = np.where(free[:, None], ends, np.nan)
+        arms.next_vertex[which[free]] = -1
         arms.blind[which[self.follower.distance(steps, ends) < _ARRIVED]] = 0
         return steps, points, free
 

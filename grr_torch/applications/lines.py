@@ -31,7 +31,7 @@ class Lines:
     Attributes:
         ends: (B, n) configurations at the lines' ends, NaN where not converged.
         steps: (B, n) where one control step leads; the end itself where it is near enough.
-        points: (B, width) where the tools are after the steps.
+        points: (B, width) where the tools are after the steps; NaN where these are shorter than they were to be.
         converged: (B,) ends that meet their points.
         collides: (B,) of these, ends in self-collision.
         safe: (B,) steps that converge and are free of self-collision on the way.
@@ -98,8 +98,8 @@ class Follower(Motions):
         """
         motion = self.difference(q, guesses if offsets is None else guesses + offsets)
         share = np.minimum(self.share(motion), pace)
-        if (share >= SLACK).all():
-            return self._arrive(q, p, guesses, targets, norms(motion))
+        if ((share >= SLACK) & (2.0 * norms(motion) <= self.epsilon)).all():
+            return self._arrive(q, p, guesses, targets)
         aim = self._aim(q, motion, share, _MOST_PIECES)
         rows = aim.looked.nonzero()[0]
         fraction = aim.fractions[aim.looked][:, None]
@@ -132,24 +132,26 @@ class Follower(Motions):
         points = self.task.at(position.T, rotation.permute(1, 2, 0)).numpy()
         found, reached = self._projected(aim, points, guesses.T)
         positions = points[: self.task.dimension].T
-        reached[aim.looked] &= ((positions >= bounds[0]) & (positions <= bounds[1])).all(1)
+        low, high = bounds[0] - self.tolerances.position, bounds[1] + self.tolerances.position
+        reached[aim.looked] &= ((positions >= low) & (positions <= high)).all(1)
         tools = np.full((*aim.looked.shape, self.task.width), np.nan, p.dtype)
         tools[aim.looked] = points.T
         after = np.where(aim.near[:, None], tools[:, -1], tools[:, -2])
         return self._judge(aim, found, reached, after, p, p)
 
-    def _arrive(self, q: Array, p: Array, guesses: Array, targets: Array, length: Array) -> Lines:
-        """`follow` for lines of joint-space lengths (B,) that all end within a step: nothing is on the way."""
+    def _arrive(self, q: Array, p: Array, guesses: Array, targets: Array) -> Lines:
+        """`follow` for lines so short that they end within a step, and nothing on the way is looked at."""
         solved, reached = self.solved(targets.T, guesses.T)
         ends = solved.T
-        steps, gaps = self.limited(q, ends), self.distance(q, ends)
+        (steps, uncut), gaps = self.limited(q, ends), self.distance(q, ends)
         hits, struck = self.hits(ends[:, None], reached[:, None], q, steps, reached)
         safe, hit = reached & ~struck, hits[:, 0]
-        direct = safe & ~hit & (gaps < np.where(length <= _BRIDGED, _WIDEST, 1.0) * self.epsilon)
+        direct = safe & ~hit & (gaps < _WIDEST * self.epsilon)
         wide = direct & (gaps >= self.epsilon)
         if some(wide):
             direct &= self._bridged(np.stack([q, ends], axis=1), np.stack([p, targets], axis=1), wide[:, None])
-        return Lines(ends, steps, targets, reached, hit | ~reached, safe, direct)
+        after = np.where(uncut[:, None], targets, np.nan)
+        return Lines(ends, steps, after, reached, hit | ~reached, safe, direct)
 
     def _projected(self, aim: _Aim, points: Array, guesses: Array) -> tuple[Array, Mask]:
         """Configurations (B, K + 1, n) at the points (width, M) looked at, and which meet these (B, K + 1).
@@ -186,7 +188,8 @@ class Follower(Motions):
         """Which of the lines can be followed, by configurations (B, K + 1, n) that were reached (B, K + 1) on them."""
         q, near = aim.q, aim.near
         ends = found[:, -1]
-        steps = self.limited(q, np.where(near[:, None], ends, found[:, -2]))
+        steps, uncut = self.limited(q, np.where(near[:, None], ends, found[:, -2]))
+        after = np.where(uncut[:, None], after, np.nan)
         chain = np.concatenate([q[:, None], found[:, :-2], ends[:, None]], axis=1)
         gaps = norms(self.difference(chain[:, :-1], chain[:, 1:]))
         wide = ~(gaps < self.epsilon)

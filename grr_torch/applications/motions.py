@@ -69,11 +69,11 @@ class Motions:
         solved, valid = project_columns(self.robot, self.task, *columns, self.tolerances, check_collision=False)
         return solved.numpy(), valid.numpy()
 
-    def limited(self, q: Array, towards: Array) -> Array:
-        """Configurations (B, n) towards others by at most a step, continuous joints not wrapped."""
+    def limited(self, q: Array, towards: Array) -> tuple[Array, Mask]:
+        """Configurations (B, n) towards others by at most a step, not wrapped, and which of them are there (B,)."""
         motion = self.difference(q, towards)
         share = ((1.0 - 1e-12) * self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
-        return q + np.minimum(share, 1.0)[:, None] * motion
+        return q + np.minimum(share, 1.0)[:, None] * motion, share >= 1.0
 
     def difference(self, start: Array, end: Array) -> Array:
         """`configuration.difference` of arrays."""

@@ -164,7 +164,9 @@ class Pilot:
     def _swing(self, round_: _Round, rows: Array, goals_q: Array) -> Mask:
         """Sets the steps of arms, by their rows, that are free to swing to configurations (R, n): (R,)."""
         steps, points, free = self.detours.swing(round_.arms, round_.which[rows], goals_q)
-        round_.steps.q[rows[free]], round_.steps.points[rows[free]] = steps[free], points[free]
+        rows, made = rows[free], round_.steps
+        made.q[rows], made.points[rows] = steps[free], points[free]
+        made.goals[rows] = round_.arms.swing[round_.which[rows]]
         return free
 
     def _hesitate(self, arms: Arms, which: Array, targets: Array, turned: Mask, steps: Steps) -> Mask:

@@ -37,7 +37,7 @@ def rejoin(follower: Follower, q: Tensor, ends: Tensor) -> Tensor | None:
     floor = clearance(follower, q[None])[0].clamp_max(0.0)
     free = (clearance(follower, q + fractions * motion) >= floor - 1e-9).all(0).nonzero()[:, 0]
     if len(free):
-        step = torch.from_numpy(follower.limited(q[None].numpy(), (q[None] + motion[free[:1]]).numpy()))
+        step = torch.from_numpy(follower.limited(q[None].numpy(), (q[None] + motion[free[:1]]).numpy())[0])
         if bool(never_deeper(follower, q[None], step)[0]):
             return step[0]
     return leave_contact(follower, q) if float(floor) < 0.0 else None

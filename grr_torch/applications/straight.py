@@ -26,7 +26,8 @@ class Straight:
         """Steps of arms (A,) straight to their targets (A, width), and which of these can be taken (A,)."""
         guesses, codes = self.solver.guess(torch.from_numpy(targets.astype(np.float64)), certified=False)
         nobody = np.zeros(len(which), dtype=bool)
-        lines, found, offsets = self._lines(arms, which, targets, guesses.numpy(), nobody)
+        near = guesses.numpy().astype(targets.dtype)
+        lines, found, offsets = self._lines(arms, which, targets, near, nobody)
         direct: Mask = found & lines.direct & (codes.numpy() <= 1)
         arms.offsets[which[direct]], arms.offset_at[which[direct]] = offsets[direct], targets[direct]
         return Steps(lines.steps, lines.ends, lines.points, np.full(len(which), TRACKING)), direct

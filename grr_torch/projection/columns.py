@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import torch
 from scipy.linalg.lapack import dposv
@@ -49,7 +51,7 @@ def damped_least_squares(jacobian: Tensor, error: Tensor, damping: Tensor) -> Te
 
 
 def damped_least_squares_of_few(jacobian: Array, error: Array, damping: Array) -> Array:
-    """`damped_least_squares` for arrays, by LAPACK where they are few."""
+    """`damped_least_squares` for arrays, by LAPACK where they are few; NaN where a system is singular all the same."""
     # in single precision the damping may be lost, and one singular column would make LAPACK give up all
     if jacobian.shape[2] > _LAPACK or jacobian.dtype != np.float64:
         return damped_least_squares(*(torch.from_numpy(array) for array in (jacobian, error, damping))).numpy()
@@ -57,13 +59,15 @@ def damped_least_squares_of_few(jacobian: Array, error: Array, damping: Array) -
     columns = rows.transpose(0, 2, 1)
     normal = rows @ columns
     normal.reshape(len(rows), len(error) ** 2)[:, :: len(error) + 1] += damping[:, None]
-    if len(rows) <= _ONE_BY_ONE:
-        step = np.empty(jacobian.shape[1:])
-        for k, (system, transposed) in enumerate(zip(normal, columns, strict=True)):
-            solved = dposv(system.T, error[:, k])[1]
+    if len(rows) > _ONE_BY_ONE:
+        with suppress(np.linalg.LinAlgError):  # one of them is singular
+            return (columns @ np.linalg.solve(normal, error.T[..., None]))[..., 0].T
+    step = np.full(jacobian.shape[1:], np.nan)
+    for k, (system, transposed) in enumerate(zip(normal, columns, strict=True)):
+        _, solved, failed = dposv(system.T, error[:, k])
+        if not failed:
             step[:, k] = transposed @ solved
-        return step
-    return (columns @ np.linalg.solve(normal, error.T[..., None]))[..., 0].T
+    return step
 
 
 def null_space_projector(jacobian: Tensor, damping: float) -> Tensor:
