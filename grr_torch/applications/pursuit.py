@@ -117,13 +117,16 @@ class Pursuit:
         beyond = open_ & known & np.logical_or.accumulate(shut, axis=1) & (needs >= _FAR * self.rate)
         first, out, can_meet = in_time.argmax(1), beyond.argmax(1), in_time & beyond
         met = np.where(can_meet.any(1), can_meet.argmax(1), len(steps) - 1)
-        across = beyond.any(1) & (needs[rows, out] >= steps[out])
+        near = behind & (needs[:, 0] <= _NEXT_TO)
+        across = beyond.any(1) & (needs[rows, out] >= steps[out]) & ~near
         near_out = out + np.round(_LATE * (met - out)).astype(np.int64)
         first = np.where(across, np.where(open_[rows, near_out], near_out, out), first)
-        near = behind & (needs[:, 0] <= _NEXT_TO)
         arms.caught_up[which] = np.where(near, arms.caught_up[which] + _EVERY, 0)
         meets = in_time.any(1) & behind | can_meet.any(1) & across
         meets &= (first > 0) & (arms.caught_up[which] < _CAUGHT_UP * self.rate)
+        # who is at its target does not leave it for a hole ahead; guesses beside one are rough
+        there = behind & self.follower.same_goal(arms.p[which], targets)
+        meets &= ~(there & (needs[rows, first] >= _FAR * self.rate))
         place = points[rows, first]
         kept = self.follower.task.gap_of_few(place, arms.meets[which]) < _MOVED
         arms.meets[which[meets & ~kept]] = place[meets & ~kept]
