@@ -21,6 +21,8 @@ _ON_CPU = 6000
 _ON_GPU = 1 << 18
 # so many times as much work keeps a GPU's processors busy as the CPU's
 _TIMES_ON_GPU = 16
+# of x, y, z the next one and the one before, for cross products: those of numpy take three times as long for a few
+NEXT, LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 # up to so many, on the CPU, the number of calls is the cost, not the arithmetic
 FEW = 300
 # of fewer numbers, einsum takes longer to begin than to sum

@@ -10,7 +10,7 @@ import torch
 
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.solve import Solver
-from grr_torch.pieces import Array, Mask, norms
+from grr_torch.pieces import LAST, NEXT, Array, Mask, norms
 from grr_torch.spaces.task import TaskSpace
 
 # metres around the last such point that are searched in a step, and the share of it in steps that look closely
@@ -33,8 +33,6 @@ _NEARER = 0.8
 # of the directions across
 _ANGLES = np.arange(_SIDES)[:, None] * (2.0 * math.pi / _SIDES)
 _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
-# of an axis, the next one and the one before
-_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 def nearest_feasible(
@@ -145,7 +143,7 @@ def _directions(towards: Array) -> Array:
 
 def _cross(first: Array, second: Array) -> Array:
     """Cross products (…, 3) of vectors; numpy.cross takes three times as long for a few."""
-    return first[..., _NEXT] * second[..., _LAST] - first[..., _LAST] * second[..., _NEXT]
+    return first[..., NEXT] * second[..., LAST] - first[..., LAST] * second[..., NEXT]
 
 
 def _unit(vectors: Array) -> Array:

@@ -10,14 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grr_torch.pieces import Array
+from grr_torch.pieces import LAST, NEXT, Array
 
 if TYPE_CHECKING:
     from grr_torch.robots.kinematics import KinematicTree
-
-
-# of x, y, z the next one and the one before, for cross products
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 class FewKinematics:
@@ -74,7 +70,7 @@ class FewKinematics:
         lines = frames[: len(self._path)] if self._drive is None else frames[self._path]
         axes, reach = lines[:, 2].transpose(1, 0, 2), (frames[-2, 3] - lines[:, 3]).transpose(1, 0, 2)
         rows = np.empty((6, *axes.shape[1:]), frames.dtype)
-        np.subtract(axes[_NEXT] * reach[_LAST], axes[_LAST] * reach[_NEXT], out=rows[:3])
+        np.subtract(axes[NEXT] * reach[LAST], axes[LAST] * reach[NEXT], out=rows[:3])
         rows[3:] = axes
         if self._slides:
             slides = [k for k, index in enumerate(self._path) if index in self._slides]
