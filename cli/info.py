@@ -39,9 +39,10 @@ def info(
     """
     from grr_torch.applications.routes import part_sizes
     from grr_torch.errors import ParameterError
-    from grr_torch.resolution.quality import Quality, left_out_edges, steep_edges
+    from grr_torch.resolution.quality import Quality
     from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.roadmap_file import load_roadmap, read_file
+    from grr_torch.resolution.slopes import left_out_edges, steep_edges
     from grr_torch.resolution.verify import verify_file
 
     if max_slope is not None and not max_slope > 0.0:
@@ -126,7 +127,7 @@ def _turning(roadmap: Roadmap) -> list[tuple[str, str]]:
 
 
 def _steep_rows(roadmap: Roadmap, edges: Tensor) -> list[tuple[str, str]]:
-    from grr_torch.resolution.quality import edge_slopes
+    from grr_torch.resolution.slopes import edge_slopes
 
     def place(vertex: int) -> str:
         return "(" + ", ".join(f"{value:.3f}" for value in roadmap.points[vertex].tolist()) + ")"

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import grr_torch
-from grr_torch.resolution.quality import edge_slopes, steep_edges
+from grr_torch.resolution.slopes import edge_slopes, steep_edges
 from grr_torch.spaces.cliques import draw, triangles
 from grr_torch.spaces.graph import TaskGraph, find_lattice, staggered_grid
 

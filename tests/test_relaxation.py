@@ -20,7 +20,7 @@ from grr_torch.resolution.checkpoint import UNKEPT
 from grr_torch.resolution.edges import check_edges, continuous_edges
 from grr_torch.resolution.hops import _choose, hop
 from grr_torch.resolution.refine import _network, refine
-from grr_torch.resolution.relax import Network
+from grr_torch.resolution.relax import Network, gauss_newton_step, relax
 from grr_torch.resolution.repair import repair
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import staggered_grid
@@ -102,10 +102,25 @@ def test_candidates_are_chosen_together_and_as_well_as_can_be_on_a_tree(planar_5
         assert float(net.costs(found)) == pytest.approx(float(costs.min()))
 
 
+def test_what_is_beyond_the_bound_costs_the_bound_and_does_not_pull(whole, generator):
+    q = spoilt(whole, 0.1, generator)[0].T.contiguous()
+    net = network(whole)
+    bound = 3.0 * float(net.slopes(q).median())
+    kept = net.slopes(q) < bound
+    assert 0 < int(kept.sum()) < len(kept)
+    bounded, without = replace(net, bound=bound), replace(net, edges=net.edges[:, kept], lengths=net.lengths[kept])
+    torch.testing.assert_close(bounded.slopes(q), net.slopes(q).clamp(max=bound))
+    steps = [gauss_newton_step(one, q, 1e-2) for one in (bounded, without, net)]
+    torch.testing.assert_close(steps[0], steps[1], atol=1e-9, rtol=0)
+    assert float((steps[0] - steps[2]).abs().max()) > 0.1
+    relaxed = relax(bounded, q, Tolerances(), silent)
+    assert float(bounded.costs(relaxed)) < float(bounded.costs(q))
+
+
 @pytest.mark.parametrize("every_cell_each_round", [False, True])
 def test_certification_certifies_more_cells(planar_5, monkeypatch, every_cell_each_round):
     if every_cell_each_round:
-        monkeypatch.setattr(certification, "_leeway", torch.zeros_like)
+        monkeypatch.setattr(certification, "_leeway", lambda spread, _: torch.zeros_like(spread))
     plain = grr_torch.build(planar_5, "fixed-rotation", points=400, refine=False)
     vertices = plain.resolved.nonzero()[:, 0]
     rank = torch.full_like(plain.resolved, -1, dtype=torch.long).index_put_((vertices,), torch.arange(len(vertices)))
@@ -122,6 +137,22 @@ def test_certification_certifies_more_cells(planar_5, monkeypatch, every_cell_ea
     assert float((position - net.targets.T).norm(dim=1).max()) <= 1e-4
 
 
+def test_a_second_attempt_leaves_fewer_cells_uncertified(kinova, monkeypatch):
+    attempt, given_up_from, left = certification._drawn_together, [], []
+
+    def noted(*given):
+        given_up_from.append(given[4])
+        return attempt(*given)
+
+    monkeypatch.setattr(certification, "_drawn_together", noted)
+    for most in (0, 10**9):
+        monkeypatch.setattr(certification, "_MOST_TWICE", most)
+        quality = grr_torch.build(kinova, "position").quality()
+        left.append(quality.triangles_spread + quality.triangles_wound)
+    assert given_up_from == [1.4, 1.4, 1.1]
+    assert left[1] < left[0]
+
+
 def test_cells_that_are_far_apart_are_left_alone(whole, generator):
     net, cells = network(whole), whole.graph.triangles(whole.connected)
     q = spoilt(whole, 0.2, generator)[0]
@@ -132,7 +163,7 @@ def test_cells_that_are_far_apart_are_left_alone(whole, generator):
 
 def test_what_may_have_to_be_drawn_together_is_measured_again():
     spread = torch.tensor([0.5, 0.93, 1.2, 1.4, 2.0, torch.inf])
-    torch.testing.assert_close(certification._leeway(spread), torch.tensor([0.43, 0.0, 0.0, 0.0, 0.6, 0.0]))
+    torch.testing.assert_close(certification._leeway(spread, 1.4), torch.tensor([0.43, 0.0, 0.0, 0.0, 0.6, 0.0]))
 
 
 def test_some_edges_are_judged_as_all_of_them_are(whole, generator):

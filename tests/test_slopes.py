@@ -11,11 +11,17 @@ import torch
 import grr_torch
 from grr_torch.errors import ParameterError
 from grr_torch.projection.project import Tolerances
-from grr_torch.resolution.options import slope_bound
+from grr_torch.resolution.options import bounded
 from grr_torch.resolution.problem import pose_problem
-from grr_torch.resolution.quality import edge_slopes, left_out_edges, steep_edges, without_steep_edges
 from grr_torch.resolution.refine import refine
 from grr_torch.resolution.repair import repair
+from grr_torch.resolution.slopes import (
+    edge_slopes,
+    left_out_edges,
+    steep_edges,
+    with_raised_bound,
+    without_steep_edges,
+)
 from grr_torch.resolution.verify import verify_file
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import staggered_grid
@@ -102,24 +108,51 @@ def test_the_preset_bounds_its_own_grid_alone(kinova):
         "given": grr_torch.build(kinova, "position", refine=False, max_slope=10.0),
         "none": grr_torch.build(kinova, "position", refine=False, max_slope=math.inf),
     }
-    preset = kinova.preset.problems["position"].max_slope
     found = {name: roadmap.parameters["max_slope"] for name, roadmap in bounds.items()}
-    assert found == {"of the preset": preset, "other points": None, "other task": None, "given": 10.0, "none": None}
+    own = found.pop("of the preset")
+    assert own >= kinova.preset.problems["position"].max_slope
+    assert found == {"other points": None, "other task": None, "given": 10.0, "none": None}
     whole, left = bounds["none"], bounds["of the preset"]
-    assert torch.equal(left.connected, whole.connected.index_fill(0, steep_edges(whole, preset), False))
+    assert torch.equal(left.connected, whole.connected.index_fill(0, steep_edges(whole, own), False))
 
 
 @pytest.mark.parametrize("task", ["position", "fixed-rotation"])
 def test_of_the_preset_s_grids_nearly_all_edges_are_left_and_lie_within_the_bound(kinova, task):
-    roadmap = grr_torch.build(kinova, task)
-    assert int(roadmap.connected.sum()) >= 0.995 * int(roadmap.resolved[roadmap.edges].all(1).sum())
-    assert roadmap.quality().smoothness_max <= kinova.preset.problems[task].max_slope
+    roadmap, problem = grr_torch.build(kinova, task), kinova.preset.problems[task]
+    connected = int(roadmap.connected.sum()) / int(roadmap.resolved[roadmap.edges].all(1).sum())
+    assert connected >= (problem.connectivity or 0.995)
+    assert roadmap.quality().smoothness_max <= roadmap.parameters["max_slope"]
 
 
-def test_random_grr_has_no_bound_of_the_preset(kinova):
+@pytest.mark.parametrize("connectivity", [0.0, 0.9, 0.97, 1.0])
+def test_the_bound_is_raised_as_far_as_so_many_edges_take_it_and_no_further(pair, tmp_path, connectivity):
+    free, bounded = pair
+    raised = with_raised_bound(bounded, connectivity)
+    between = int(bounded.resolved[bounded.edges].all(1).sum())
+    wanted = min(int(free.connected.sum()), math.ceil(connectivity * between))
+    bound, slopes = raised.parameters["max_slope"], edge_slopes(raised)
+    assert len(slopes) >= wanted
+    assert raised is bounded or int((slopes < bound - 1e-3).sum()) < wanted
+    assert bool(raised.connected[bounded.connected].all())
+    assert torch.equal(raised.connected, without_steep_edges(replace(free, parameters=raised.parameters)).connected)
+    assert (raised is bounded) == (wanted <= int(bounded.connected.sum()))
+    raised.save(tmp_path / "m.grr")
+    assert all(check.passed for check in verify_file(tmp_path / "m.grr"))
+
+
+def test_a_map_without_a_bound_has_none_to_raise(pair):
+    free, _ = pair
+    assert with_raised_bound(free, 1.0) is free
+
+
+def test_the_bound_of_the_preset_is_for_expansions_that_are_not_told_otherwise(kinova):
     problem = pose_problem(kinova, "position")
-    assert problem.max_slope is not None
-    assert slope_bound(None, problem, "random") is None
+    assert None not in (problem.max_slope, problem.connectivity)
+    assert bounded(problem, None, "expansion") == problem
+    for given, method in ((None, "random"), (math.inf, "expansion")):
+        assert bounded(problem, given, method)[3:] == (None, None)
+    # what is asked for holds as it is
+    assert bounded(problem, 9.0, "expansion")[3:] == (9.0, None)
 
 
 def test_the_preset_bounds_its_grid_however_it_is_given(kinova):
@@ -131,13 +164,13 @@ def test_the_preset_bounds_its_grid_however_it_is_given(kinova):
     assert pose_problem(kinova, "position", staggered_grid([(0.2, 0.6)] * 3, 50)).max_slope is None
 
 
-@pytest.mark.parametrize(("given", "bounded"), [([], True), (["--max-slope", "inf"], False)])
-def test_the_command_takes_the_bound_of_the_preset(kinova, run_cli, given, bounded):
-    expected = kinova.preset.problems["position"].max_slope if bounded else None
+@pytest.mark.parametrize(("given", "has_one"), [([], True), (["--max-slope", "inf"], False)])
+def test_the_command_takes_the_bound_of_the_preset(kinova, run_cli, given, has_one):
     words = ["build", "--robot", "kinova", "--task", "position", "--no-refine", "--out", "m.grr", "--no-record"]
     code, _, _ = run_cli(*words, *given)
     assert code == 0
-    assert grr_torch.Roadmap.load("m.grr").parameters["max_slope"] == expected
+    found = grr_torch.Roadmap.load("m.grr").parameters["max_slope"]
+    assert (found is not None and found >= kinova.preset.problems["position"].max_slope) if has_one else found is None
 
 
 def test_a_last_repair_moves_nothing_for_edges_that_are_left_out(pair):

@@ -50,7 +50,7 @@ _ROUNDS = 5
 _FINAL_ROUNDS = 3
 # and of the best of these
 _LAST_ROUNDS = 10
-# edges steeper than this many times the median are not relaxed
+# edges steeper than this many times the median do not pull, and count as that steep, where there is no bound of slopes
 _STEEP = 6.0
 # an edge that is missing, broken, or steeper, counts as this many times the smallest median of slopes
 _MISSING = 40.0
@@ -75,6 +75,7 @@ def find_seeds(
     *,
     candidates: int = CANDIDATES,
     seed: int = 0,
+    max_slope: float | None = None,
     tolerances: Tolerances,
     progress: Progress = silent,
 ) -> Tensor:
@@ -86,6 +87,7 @@ def find_seeds(
         graph: The task graph that will be expanded; a coarser one over its bounds is tried out first.
         candidates: How many sets of seeds are compared.
         seed: Of all random draws.
+        max_slope: Slope [rad/m] above which edges are to be left out; None: no bound.
         tolerances: Of the projections.
         progress: Told what is being done and how far it is.
 
@@ -113,14 +115,16 @@ def find_seeds(
     def tried(seeds: Tensor) -> tuple[Tensor]:
         # a map and its relaxation are all that a process holds besides
         expanded = _expansions(robot, task, graph, [seeds], default_neighbours(task), tolerances)
-        return (_relaxed(robot, task, graph, expanded, tolerances, _FINAL_ROUNDS),)
+        return (_relaxed(robot, task, graph, expanded, tolerances, _FINAL_ROUNDS, max_slope),)
 
     maps = torch.cat([found for (found,) in at_once(tried, finalists, robot.device)])
     progress("choosing seeds", 3, 3)
     slopes = _slopes(robot, task, graph, maps)
-    slopes[_broken(robot, task, graph, maps, slopes, tolerances)] = torch.nan
+    broken = _broken(robot, task, graph, maps, slopes, tolerances)
+    slopes = slopes if max_slope is None else slopes.clamp(max=max_slope)
+    slopes[broken] = torch.nan if max_slope is None else max_slope
     best = maps[int(_sums(slopes).argmin())]
-    best = _relaxed(robot, task, graph, best[None], tolerances, _LAST_ROUNDS)[0]
+    best = _relaxed(robot, task, graph, best[None], tolerances, _LAST_ROUNDS, max_slope)[0]
     found = best[~best.isnan().any(1)]
     # on a graph with few vertices within reach none may have been placed
     return in_the_middle(robot, found) if len(found) else finalists[0]
@@ -209,23 +213,31 @@ def _broken(
 
 
 def _relaxed(
-    robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor, tolerances: Tolerances, rounds: int
+    robot: Robot,
+    task: TaskSpace,
+    graph: TaskGraph,
+    maps: Tensor,
+    tolerances: Tolerances,
+    rounds: int,
+    max_slope: float | None = None,
 ) -> Tensor:
-    """Maps (C, V, n), relaxed together over all edges between resolved vertices that are not steep."""
+    """Maps (C, V, n), relaxed together over all edges between resolved vertices; what is steep does not pull."""
     copies = Copies.of(graph, len(maps))
     q = maps.reshape(-1, robot.n)
     first, second = copies.edges.to(q.device).unbind(1)
     points = copies.points.to(q)
     lengths = task.distance(points[first], points[second])
     slopes = _slopes(robot, task, graph, maps).flatten()
-    if not bool(slopes.isfinite().any()):
+    known = slopes.isfinite()
+    if not bool(known.any()):
         return maps
-    kept = slopes <= _STEEP * float(slopes[slopes.isfinite()].median())
+    bound = _STEEP * float(slopes[known].median()) if max_slope is None else max_slope
     vertices = (~q.isnan().any(1)).nonzero()[:, 0]
     rank = torch.full((len(q),), -1, device=q.device)
     rank[vertices] = torch.arange(len(vertices), device=q.device)
-    edges = torch.stack([rank[first[kept]], rank[second[kept]]])
+    edges = torch.stack([rank[first[known]], rank[second[known]]])
     owner = vertices // len(graph.points)
-    network = Network(robot, task, points[vertices].T.contiguous(), edges, lengths[kept], parts=owner)
+    targets = points[vertices].T.contiguous()
+    network = Network(robot, task, targets, edges, lengths[known], bound=bound, parts=owner)
     moved = relax(network, q[vertices].T.contiguous(), tolerances, silent, rounds)
     return q.index_put((vertices,), moved.T).reshape(maps.shape)

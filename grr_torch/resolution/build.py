@@ -21,15 +21,15 @@ from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.edges import EdgeCheck, continuous_edges
 from grr_torch.resolution.expand import default_neighbours, expand
 from grr_torch.resolution.memory import require_memory
-from grr_torch.resolution.options import check_options, describe_build, slope_bound
+from grr_torch.resolution.options import bounded, check_options, describe_build
 from grr_torch.resolution.problem import Problem, pose_problem
-from grr_torch.resolution.quality import without_steep_edges
 from grr_torch.resolution.random_grr import random_grr
 from grr_torch.resolution.reachability import measure_reachability
 from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.roadmap_file import load_roadmap
 from grr_torch.resolution.seeds import SeedsLike
+from grr_torch.resolution.slopes import with_raised_bound, without_steep_edges
 from grr_torch.robots.crowding import crowding
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph
@@ -104,7 +104,7 @@ def build(
         OutputError: The checkpoint cannot be written, is there without `resume`, or another build is using it.
     """
     problem = pose_problem(robot, task, points, bounds, seeds, rotations)
-    max_slope = slope_bound(max_slope, problem, method)
+    problem = bounded(problem, max_slope, method)
     options: dict[str, Any] = {
         "method": method,
         "candidates": candidates,
@@ -112,7 +112,7 @@ def build(
         "samples": samples,
         "refine": refine,
         "objectives": dict(objectives or {}),
-        "max_slope": max_slope,
+        "max_slope": problem.max_slope,
         "reachability": reachability,
         "seed": seed,
         "tolerances": asdict(tolerances),
@@ -137,7 +137,7 @@ def build(
         settings = {
             "margin": robot.margin,
             "seed": seed,
-            "max_slope": max_slope,
+            "max_slope": problem.max_slope,
             "reachability": reachability,
             "tolerances": asdict(tolerances),
         }
@@ -151,6 +151,8 @@ def build(
             roadmap = refine_roadmap(
                 roadmap, objectives=objectives, seed=seed, check=check, progress=progress, checkpoint=kept
             )
+        if problem.connectivity is not None:
+            roadmap = with_raised_bound(roadmap, problem.connectivity)
         if reachability:
             roadmap = _with_reachability(roadmap, tolerances, progress, kept)
         if kept.folder is not None:
@@ -244,8 +246,8 @@ def _with_seeds(
         return problem
 
     def find() -> dict[str, Tensor]:
-        options = {"candidates": candidates, "seed": seed}
-        found = find_seeds(robot, problem.task, problem.graph, **options, tolerances=tolerances, progress=progress)
+        what: dict[str, Any] = {"candidates": candidates, "seed": seed, "max_slope": problem.max_slope}
+        found = find_seeds(robot, problem.task, problem.graph, **what, tolerances=tolerances, progress=progress)
         return {"seeds": found}
 
     return problem._replace(seeds=kept.once("seeds", find)["seeds"].to(robot.device))

@@ -26,6 +26,10 @@ _SUSPECT = 0.6
 # spread that is aimed at [rad], and beyond which a cell is given up [rad]
 _AIM = 0.93
 _HOPELESS = 1.4
+# and in a second attempt, where more cells are left below this than between the two, which may hold those
+_HOPELESS_AGAIN = 1.1
+# cells of maps that are attempted twice: it takes long
+_MOST_TWICE = 65536
 # how much a pull counts against an edge of typical weight
 _WEIGHT = 3.0
 _DAMPING = 0.3
@@ -57,24 +61,34 @@ def certify(
         checkpoint: Where it is kept how far that is.
     """
     checkpoint = checkpoint or Checkpoint()
-    looking, kept, looking_again = map(checkpoint.stage, ("spread", "certification", "spread-again"))
+    names = ("spread", "certification", "spread-again", "certification-again", "spread-at-last")
+    looking, *stages = map(checkpoint.stage, names)
     robot, task, points = network.robot, network.task, network.targets.T
 
-    def measure(q: Tensor, cells: Tensor, stage: Stage) -> tuple[Tensor, int]:
-        spread = spreads(robot, task, points, q.T, cells, tolerances, progress, stage)
-        return spread, int((spread > LARGEST_SPREAD).sum())
-
-    with one_thread(), torch.no_grad():
-        spread, before = measure(q, corners, looking)
-        if before == 0:
-            return q
-        suspects = spread > _SUSPECT
-        moved = _drawn_together(network, corners[suspects], spread[suspects], q, tolerances, progress, kept)
-        progress("certifying", _ROUNDS, _ROUNDS)
+    def attempt(hopeless: float, kept: Stage, looking_again: Stage) -> tuple[Tensor, Tensor]:
+        given = corners[suspects], spread[suspects], q, hopeless
+        moved = _drawn_together(network, *given, tolerances, progress, kept)
         # cells that were not looked at may have suffered, where their corners have moved far enough
         doubtful = ~(spread + _GROWTH * _way(network, corners, q, moved) <= LARGEST_SPREAD)
-        _, after = measure(moved, corners[doubtful], looking_again)
-    return moved if after < before else q
+        again = spreads(robot, task, points, moved.T, corners[doubtful], tolerances, progress, looking_again)
+        return moved, again[again > LARGEST_SPREAD]
+
+    with one_thread(), torch.no_grad():
+        spread = spreads(robot, task, points, q.T, corners, tolerances, progress, looking)
+        best, left = q, spread[spread > LARGEST_SPREAD]
+        if len(left) == 0:
+            return q
+        suspects = spread > _SUSPECT
+        moved, found = attempt(_HOPELESS, *stages[:2])
+        if len(found) < len(left):
+            best, left = moved, found
+        near, farther = found <= _HOPELESS_AGAIN, (found > _HOPELESS_AGAIN) & (found <= _HOPELESS)
+        if 0 < int(farther.sum()) < int(near.sum()) and len(corners) <= _MOST_TWICE:
+            moved, found = attempt(_HOPELESS_AGAIN, *stages[2:])
+            if len(found) < len(left):
+                best = moved
+    progress("certifying", _ROUNDS, _ROUNDS)
+    return best
 
 
 def _drawn_together(
@@ -82,6 +96,7 @@ def _drawn_together(
     corners: Tensor,
     spread: Tensor,
     q: Tensor,
+    hopeless: float,
     tolerances: Tolerances,
     progress: Progress,
     kept: Stage,
@@ -104,7 +119,7 @@ def _drawn_together(
     for done in range(begin, _ROUNDS + 1):
         progress("certifying", done, _ROUNDS)
         # the others will hardly have come to where they are pulled, or no longer are
-        again = (2.0 * travelled >= _leeway(spread)).nonzero()[:, 0]
+        again = (2.0 * travelled >= _leeway(spread, hopeless)).nonzero()[:, 0]
         spread[again], pairs, apart = _spread(network, corners[again], q, tolerances)
         travelled[again] = 0.0
         uncertified = int((spread > LARGEST_SPREAD).sum())
@@ -112,10 +127,10 @@ def _drawn_together(
             best, fewest = q, uncertified
         before, waited = (uncertified, 0) if uncertified < _FALLEN * before else (before, waited + 1)
         if waited == _PATIENCE and sacrifices < _SACRIFICES:
-            given_up |= _worst_of_neighbours(network, corners, spread)
+            given_up |= _worst_of_neighbours(network, corners, spread, hopeless)
             sacrifices, waited = sacrifices + 1, 0
         excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
-        pulled = ((excess > 0.0) & ((spread <= _HOPELESS) & ~given_up)[again].repeat(3)).nonzero()[:, 0]
+        pulled = ((excess > 0.0) & ((spread <= hopeless) & ~given_up)[again].repeat(3)).nonzero()[:, 0]
         numbers = {"fewest": fewest, "before": before, "waited": waited, "sacrifices": sacrifices}
         watched = {"given_up": given_up, "spread": spread, "travelled": travelled}
         if done == _ROUNDS or uncertified == 0 or waited == _PATIENCE or len(pulled) == 0:
@@ -137,9 +152,9 @@ def _way(network: Network, corners: Tensor, q: Tensor, moved: Tensor) -> Tensor:
     return way[corners].amax(1)
 
 
-def _leeway(spread: Tensor) -> Tensor:
+def _leeway(spread: Tensor, hopeless: float) -> Tensor:
     """How much the spread of cells (C,) would have to change to be drawn together, or not any more [rad]."""
-    leeway = torch.maximum(_AIM - spread, spread - _HOPELESS).clamp_min(0.0)
+    leeway = torch.maximum(_AIM - spread, spread - hopeless).clamp_min(0.0)
     # of a cell that could not be followed to its centre nothing is known
     return torch.where(spread.isinf(), 0.0, leeway)
 
@@ -149,10 +164,10 @@ def _state(q: Tensor, best: Tensor, watched: dict[str, Tensor], numbers: dict[st
     return {"q": q, "best": best, **watched, **tensors}
 
 
-def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor) -> Tensor:
+def _worst_of_neighbours(network: Network, corners: Tensor, spread: Tensor, hopeless: float) -> Tensor:
     """(C,) cells above the limit that share a corner with none that is worse, of those that are not hopeless."""
     worst = spread.new_zeros(network.targets.shape[1])
-    open_cells = (spread > LARGEST_SPREAD) & (spread <= _HOPELESS)
+    open_cells = (spread > LARGEST_SPREAD) & (spread <= hopeless)
     counted = torch.where(open_cells, spread, 0.0)
     worst = worst.scatter_reduce(0, corners.flatten(), counted.repeat_interleave(3), "amax")
     return open_cells & (spread >= worst[corners].amax(1))

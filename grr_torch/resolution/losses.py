@@ -16,8 +16,8 @@ from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
 from grr_torch.resolution.edges import EdgeCheck, check_edges, continuous_edges
-from grr_torch.resolution.quality import within_bound
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.slopes import within_bound
 
 # edges of maps that are checked whole again
 _MOST_CHECKED = 65536

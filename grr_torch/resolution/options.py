@@ -26,7 +26,7 @@ from grr_torch.version import __version__
 
 METHODS = ("expansion", "random")
 # of what stages keep, and of how they come to it
-CHECKPOINT_VERSION = 6
+CHECKPOINT_VERSION = 7
 _MOST_STARTS = 100_000
 
 
@@ -76,11 +76,11 @@ def _check_problem(robot: Robot, task: TaskSpace, points: Any, bounds: Any, rota
         check_seeds(robot, seeds)
 
 
-def slope_bound(given: float | None, problem: Problem, method: str) -> float | None:
-    """The `max_slope` of a roadmap: what is given, or for an expansion the problem's own; None: no bound."""
-    if given is None:
-        return problem.max_slope if method == "expansion" else None
-    return None if given == math.inf else given
+def bounded(problem: Problem, max_slope: float | None, method: str) -> Problem:
+    """A problem with the bound of slopes of a build: what is given, or for an expansion the problem's own."""
+    if max_slope is None and method == "expansion":
+        return problem
+    return problem._replace(max_slope=None if max_slope == math.inf else max_slope, connectivity=None)
 
 
 def describe_build(robot: Robot, problem: Problem, options: Mapping[str, Any]) -> dict[str, Any]:

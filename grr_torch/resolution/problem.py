@@ -29,12 +29,14 @@ class Problem(NamedTuple):
         graph: Its task graph.
         seeds: A table of configurations, or "auto".
         max_slope: D_q / D_p above which edges are left out unless told otherwise [rad/m]; None: no bound.
+        connectivity: Share of the edges for which that bound is raised, if fewer keep it; None: for none.
     """
 
     task: TaskSpace
     graph: TaskGraph
     seeds: SeedsLike | str
     max_slope: float | None = None
+    connectivity: float | None = None
 
 
 def pose_problem(
@@ -171,16 +173,14 @@ def _complete(
         graph = _turned(task, graph, rotations, problem)
     if graph.points.shape[1] != task.width:
         raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.width} for {task.name}")
-    return Problem(task, graph, seeds, _max_slope(graph, problem))
+    bounds_of_slopes = (problem.max_slope, problem.connectivity) if problem and _is_grid_of(graph, problem) else ()
+    return Problem(task, graph, seeds, *bounds_of_slopes)
 
 
-def _max_slope(graph: TaskGraph, problem: Preset | None) -> float | None:
-    """The preset's bound of slopes, if the graph is the preset's grid: slopes depend on how fine a grid is."""
-    if problem is None or problem.max_slope is None:
-        return None
+def _is_grid_of(graph: TaskGraph, problem: Preset) -> bool:
+    """Whether a graph is the preset's grid: slopes depend on how fine a grid is."""
     own = staggered_grid(problem.bounds, problem.points)
-    same = torch.equal(graph.points, own.points) and torch.equal(graph.edges, own.edges)
-    return problem.max_slope if same else None
+    return torch.equal(graph.points, own.points) and torch.equal(graph.edges, own.edges)
 
 
 def _grid(

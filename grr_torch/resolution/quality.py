@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
 from grr_torch.progress import Progress, silent
-from grr_torch.spaces.configuration import distance
+from grr_torch.resolution.slopes import edge_slopes, steep_edges
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
-
-
-# slopes above so many times the median are suspect
-STEEP = 10.0
 
 
 @dataclass(frozen=True)
@@ -127,49 +122,6 @@ def measure_quality(roadmap: Roadmap, progress: Progress = silent) -> Quality:
     )
 
 
-def steep_edges(roadmap: Roadmap, max_slope: float | None = None) -> Tensor:
-    """Indices (K,) of connected edges with D_q / D_p above `max_slope` [rad/m], the steepest first.
-
-    The paper's continuity check lets pass an edge between unrelated configurations that a self-motion joins; its slope
-    gives it away.
-
-    Args:
-        roadmap: The roadmap.
-        max_slope: Ten times the median by default.
-    """
-    slopes = edge_slopes(roadmap)
-    if len(slopes) == 0:
-        return torch.empty(0, dtype=torch.long)
-    limit = STEEP * float(slopes.median()) if max_slope is None else max_slope
-    steep = (slopes > limit).nonzero()[:, 0]
-    return roadmap.connected.nonzero()[:, 0][steep[slopes[steep].argsort(descending=True)]]
-
-
-def left_out_edges(roadmap: Roadmap) -> Tensor:
-    """Indices (K,) of edges that are not connected because they are steeper than what the roadmap was built with.
-
-    Steeper than its `max_slope`, that is; the steepest first, and none if it has no such bound. Some of them may
-    not be continuous either.
-    """
-    limit = roadmap.parameters.get("max_slope")
-    if limit is None:
-        return torch.empty(0, dtype=torch.long)
-    edges = (roadmap.resolved[roadmap.edges].all(1) & ~roadmap.connected).nonzero()[:, 0]
-    slopes = edge_slopes(roadmap, edges)
-    order = slopes.argsort(descending=True)
-    return edges[order[slopes[order] > limit]]
-
-
-def without_steep_edges(roadmap: Roadmap) -> Roadmap:
-    """The roadmap whose edges steeper than its parameter `max_slope` [rad/m], if it has one, are not connected."""
-    limit = roadmap.parameters.get("max_slope")
-    if limit is None:
-        return roadmap
-    connected = roadmap.connected.clone()
-    connected[steep_edges(roadmap, limit)] = False
-    return replace(roadmap, connected=connected)
-
-
 def _count_cells(roadmap: Roadmap, progress: Progress) -> dict[str, Any]:
     counts: dict[str, Any] = {}
     for name, cells in zip(("triangles", "squares"), roadmap.cells(progress), strict=True):
@@ -178,29 +130,6 @@ def _count_cells(roadmap: Roadmap, progress: Progress) -> dict[str, Any]:
         counts[f"{name}_spread"] = int(cells.spread_out.sum())
         counts[f"{name}_certified"] = _ratio(int(cells.certified.sum()), len(cells.corners))
     return counts
-
-
-def edge_slopes(roadmap: Roadmap, edges: Tensor | None = None) -> Tensor:
-    """D_q / D_p (K,) of edges between resolved vertices [rad/m], (E,) bool or their indices; by default the connected.
-
-    Where D_q and D_p are distances of joint and of task space (Section IV-B of the paper).
-    """
-    return _slopes(roadmap, roadmap.edges[roadmap.connected if edges is None else edges])
-
-
-def within_bound(roadmap: Roadmap, edges: Tensor) -> Tensor:
-    """(E,) edges (E, 2) that are not steeper than the roadmap's parameter `max_slope`; all, if it has none."""
-    limit = roadmap.parameters.get("max_slope")
-    if limit is None:
-        return torch.ones(len(edges), dtype=torch.bool)
-    return _slopes(roadmap, edges) <= limit
-
-
-def _slopes(roadmap: Roadmap, edges: Tensor) -> Tensor:
-    first, second = edges.T
-    q, points = roadmap.configurations, roadmap.points
-    moved = distance(q[first], q[second], roadmap.robot.continuous.cpu())
-    return moved / roadmap.task.distance(points[first], points[second])
 
 
 def _residuals(roadmap: Roadmap) -> tuple[Tensor, Tensor]:

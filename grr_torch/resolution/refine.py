@@ -17,11 +17,11 @@ from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.edges import EdgeCheck
 from grr_torch.resolution.losses import is_large
 from grr_torch.resolution.objectives import Objective, check_objectives, measure_objective
-from grr_torch.resolution.quality import edge_slopes, without_steep_edges
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.resolution.repair import repair
 from grr_torch.resolution.report import before_refinement
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.slopes import edge_slopes, without_steep_edges
 
 # of an objective's scale: no arm is at a singularity or a limit everywhere
 _LEAST_SCALE = 1e-9

@@ -8,6 +8,7 @@ its squares stand for the norms themselves (iteratively reweighted least squares
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -106,6 +107,7 @@ class Network:
         edges: (2, E) vertices of each edge.
         lengths: (E,) D_p of each edge.
         objectives: What else counts.
+        bound: Slope [rad/m] that steeper edges count as, and from which on they do not pull.
         parts: (V,) number of the map that a vertex belongs to, if there are several without edges between them: each
             then has steps, a damping and an end of its own, but all hop together.
     """
@@ -116,6 +118,7 @@ class Network:
     edges: Tensor
     lengths: Tensor
     objectives: tuple[Objective, ...] = ()
+    bound: float = math.inf
     parts: Tensor | None = None
 
     @cached_property
@@ -141,9 +144,9 @@ class Network:
         return in_pieces(measure, self.edges, self.lengths)[0]
 
     def slopes_between(self, first: Tensor, second: Tensor, lengths: Tensor) -> Tensor:
-        """(…) D_q / D_p, rounded off at zero, between configurations (n, …) at points so far apart."""
+        """(…) D_q / D_p between configurations (n, …) at points so far apart, rounded off at zero and at the bound."""
         moved = difference(first, second, self.robot.continuous.view(-1, *(1,) * (first.ndim - 1)))
-        return moved.square().sum(0).add_(_SHORTEST**2).sqrt_() / lengths
+        return (moved.square().sum(0).add_(_SHORTEST**2).sqrt_() / lengths).clamp_max_(self.bound)
 
     def by_part(self, values: Tensor) -> Tensor:
         """(P,) sums of values of edges (E,), by part."""
@@ -219,7 +222,8 @@ def gauss_newton_step(network: Network, q: Tensor, damping: float | Tensor, pull
     robot = network.robot
     motions = network.motions(q)
     (moved,) = in_pieces(lambda part: (part.square().sum(0),), motions)
-    weights = 1.0 / (moved.add_(_SHORTEST**2).sqrt_() * network.lengths)
+    moved.add_(_SHORTEST**2).sqrt_()
+    weights = torch.where(moved < network.bound * network.lengths, 1.0 / (moved * network.lengths), 0.0)
 
     def null_space(part: Tensor, targets: Tensor) -> tuple[Tensor]:
         jacobian = network.task.jacobian(robot.tree.jacobian(robot.tree.frames(part)), targets)

@@ -14,9 +14,9 @@ from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.resolution.checkpoint import Checkpoint, Stage
 from grr_torch.resolution.edges import EdgeCheck, continuous_pairs
 from grr_torch.resolution.losses import FlagCheck, is_large, moved, without_losses
-from grr_torch.resolution.quality import STEEP, edge_slopes
 from grr_torch.resolution.reachability import within_reach
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.slopes import STEEP, edge_slopes
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import TaskGraph
 
@@ -26,6 +26,8 @@ _BESIDE, _SIDESTEP = 8, 0.2
 _ROUNDS = 5
 # candidates of a vertex whose edges are checked
 _CHECKED = 3
+# share of its cost that a vertex has to gain
+_LEAST_GAIN = 1e-6
 # what a repair changes
 _CHANGING = ("configurations", "connected", "wave")
 
@@ -160,7 +162,7 @@ def _unresolved_at_the_rim(roadmap: Roadmap) -> Tensor:
 
 
 def _reconsider(roadmap: Roadmap, vertices: Tensor, starts: int, means: _Means) -> Roadmap:
-    """Gives some vertices, no two of them neighbours, the candidate that connects most edges, if it connects more."""
+    """Gives some vertices, no two of them neighbours, the candidate whose edges cost least, if they cost less."""
     candidates = _candidates(roadmap, _independent(roadmap, vertices), starts, means)
     if len(candidates.vertices) == 0:
         return roadmap
@@ -224,17 +226,25 @@ def _try(roadmap: Roadmap, candidates: _Candidates, means: _Means) -> _Trial:
 
 
 def _choose(roadmap: Roadmap, candidates: _Candidates, trial: _Trial) -> Tensor:
-    """Indices (K,) of candidates that connect more edges than their vertex has, at most one a vertex."""
+    """Indices (K,) of candidates that connect more edges than their vertex has, and are worth it; at most one a vertex.
+
+    An edge costs its slope. One that is not connected costs the bound from which on edges are left out; without a
+    bound, more than all others together.
+    """
     vertices, count = candidates.vertices, len(candidates.vertices)
-    connects = _sums(count, trial.rank, trial.joined)
-    steepness = _sums(count, trial.rank, torch.where(trial.joined, trial.slopes, 0.0))
+    slopes = edge_slopes(roadmap)
+    charge = roadmap.parameters.get("max_slope") or 1.0 + float(trial.slopes.sum() + slopes.sum())
+    costs = _sums(count, trial.rank, torch.where(trial.joined, trial.slopes, charge))
     lost = _sums(count, trial.rank, roadmap.connected[trial.edges] & ~trial.joined)
-    had = _sums(len(roadmap.points), roadmap.edges[roadmap.connected].flatten())
-    # most edges first, and of those that connect as many the least steep; none that was connected may be lost
-    score = torch.where(lost > 0.0, -torch.inf, connects - steepness / (1.0 + steepness.max()))
-    best = torch.full((len(roadmap.points),), -torch.inf, dtype=torch.float64)
-    best.scatter_reduce_(0, vertices, score, "amax")
-    chosen = ((score == best[vertices]) & (connects > had[vertices]) & (score > -torch.inf)).nonzero()[:, 0]
+    gained = _sums(count, trial.rank, trial.joined & ~roadmap.connected[trial.edges])
+    own = torch.full((len(roadmap.edges),), charge, dtype=torch.float64)
+    own[roadmap.connected] = slopes.double()
+    known = roadmap.resolved[roadmap.edges].all(1)
+    had = _sums(len(roadmap.points), roadmap.edges[known].flatten(), own[known].repeat_interleave(2))
+    had[~roadmap.resolved] = torch.inf
+    costs[(lost > 0.0) | (gained == 0.0)] = torch.inf
+    least = torch.full_like(had, torch.inf).scatter_reduce(0, vertices, costs, "amin")
+    chosen = ((costs == least[vertices]) & (costs < (1.0 - _LEAST_GAIN) * had[vertices])).nonzero()[:, 0]
     # of two that are equal, the first
     return chosen[vertices[chosen].diff(prepend=torch.tensor([-1])) != 0]
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from grr_torch.progress import Progress
 from grr_torch.resolution.checkpoint import Stage
 from grr_torch.resolution.objectives import OBJECTIVES
-from grr_torch.resolution.quality import Quality, edge_slopes
+from grr_torch.resolution.quality import Quality
+from grr_torch.resolution.slopes import edge_slopes
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap

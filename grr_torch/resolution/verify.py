@@ -16,8 +16,9 @@ from grr_torch.errors import UrdfError
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.edges import check_edges
-from grr_torch.resolution.quality import quality_differences, without_steep_edges
+from grr_torch.resolution.quality import quality_differences
 from grr_torch.resolution.roadmap_file import load_roadmap, metadata_hash, read_file, solving_tables
+from grr_torch.resolution.slopes import without_steep_edges
 from grr_torch.robots.read_urdf import parse_urdf
 from grr_torch.robots.urdf_json import urdf_to_json
 from grr_torch.tensor_file import tensor_hash

@@ -22,6 +22,7 @@ class Problem:
         rotation: Fixed-axis roll, pitch, yaw of the tool [rad], for `fixed-rotation`, and for `yaw` at yaw 0.
         rotations: How many rotations the grid has, where rotation varies.
         max_slope: D_q / D_p above which edges of this very grid are left out [rad/m]; None: no bound.
+        connectivity: Share of the edges for which that bound is raised, if fewer keep it; None: for none.
     """
 
     points: int
@@ -30,6 +31,7 @@ class Problem:
     rotation: tuple[float, float, float] | None
     rotations: int | None = None
     max_slope: float | None = None
+    connectivity: float | None = None
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,7 @@ def _problem(entry: Mapping[str, Any]) -> Problem:
         rotation=None if rotation is None else (float(rotation[0]), float(rotation[1]), float(rotation[2])),
         rotations=entry.get("rotations"),
         max_slope=entry.get("max_slope"),
+        connectivity=entry.get("connectivity"),
     )
 
 
