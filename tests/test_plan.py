@@ -138,7 +138,8 @@ def test_the_deviation_is_that_of_the_tool_from_its_straight_lines(roadmap):
     line = corners.diff(dim=0)
     share = ((position[:, None] - corners[:-1]) * line).sum(2) / line.square().sum(1)
     apart = (position[:, None] - corners[:-1] - share.clamp(0.0, 1.0)[..., None] * line).norm(dim=2).amin(1)
-    assert path.max_deviation == pytest.approx(apart.max().item(), rel=0.05)
+    # at a corner, the line after it may be nearer by part of a projection's tolerance
+    assert path.max_deviation == pytest.approx(apart.max().item(), rel=0.05, abs=2e-5)
     coarse = roadmap.plan(start, goal, step=0.1)
     assert_is_a_path(roadmap, coarse, step=0.1)
     assert len(coarse.times) < len(path.times)

@@ -9,11 +9,12 @@ import pytest
 import torch
 
 import grr_torch
-from grr_torch.applications import solve
+from grr_torch.applications import around, solve
 from grr_torch.applications.many_guesses import ManyGuesses
 from grr_torch.applications.solve import STATUSES
 from grr_torch.errors import ParameterError
 from grr_torch.spaces.cliques import triangles
+from grr_torch.spaces.configuration import distance
 
 
 @pytest.fixture(scope="module", params=["planar", "kinova"])
@@ -84,6 +85,27 @@ def test_small_moves_of_the_point_are_small_moves_of_the_arm(roadmap):
     # a projection stops anywhere within its tolerance
     assert float(moved.median()) < 1e-3
     assert float(moved.max()) < 0.05
+
+
+def test_joints_move_less_along_lines_than_with_weights_of_algorithm_3(roadmap, monkeypatch):
+    ends = _inside(roadmap, 200).reshape(100, 2, 1, -1)
+    along = torch.linspace(0.0, 1.0, 301, dtype=torch.float64)[:, None]
+    lines = ends[:, 0] * (1.0 - along) + ends[:, 1] * along
+
+    def motion() -> tuple[torch.Tensor, torch.Tensor]:
+        solution = dataclasses.replace(roadmap).solve(lines)
+        q = solution.configurations
+        moved = distance(q[:, 1:], q[:, :-1], roadmap.robot.continuous)
+        return moved, solution.valid.all(1)
+
+    ours, valid = motion()
+    with monkeypatch.context() as patch:
+        patch.setattr(around, "_weights", lambda distances, k, _: 1.0 / np.square(np.maximum(distances[:, :k], 1e-12)))
+        theirs, also = motion()
+    both = valid & also
+    assert int(both.sum()) > 10
+    assert float(ours[both].sum()) < 0.97 * float(theirs[both].sum())
+    assert float(ours[both].amax(1).mean()) < 0.5 * float(theirs[both].amax(1).mean())
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (3, 1, 2)])

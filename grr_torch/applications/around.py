@@ -30,7 +30,7 @@ _AT_ONCE = 1 << 21
 
 
 class Around:
-    """The vertices nearest by position, weighted by (r / d − 1)², where r is the distance of the next one."""
+    """The vertices nearest by position, weighted by r / d − 1, where r is the distance of the next one."""
 
     def __init__(self, roadmap: Roadmap, vertices: Tensor, radius: float) -> None:
         """For the resolved vertices (S,) of a roadmap, whose longest edge is `radius` [m]."""
@@ -109,9 +109,9 @@ class AroundProduct:
 
 
 def _weights(distances: Array, k: int, farthest: float) -> Array:
-    """(r / d − 1)² (N, k) of the k nearest, by distances (N, k or more); where there is no next one, 1 / d²."""
+    """Weights r / d − 1 (N, k) of the k nearest, by distances (N, k or more); where there is no next one, 1 / d."""
     near = np.maximum(distances[:, :k], 1e-12)
     reach = np.minimum(distances[:, k:], farthest)
     if reach.shape[1] == 0 or not np.isfinite(reach).all():
-        return 1.0 / np.square(near)
-    return np.square(np.maximum(reach / near - 1.0, 0.0))
+        return 1.0 / near
+    return np.maximum(reach / near - 1.0, 0.0)

@@ -58,8 +58,8 @@ class ManyGuesses:
         distances, nearest = self._nearest(places)
         near = distances[:, : self._k].clamp_min(1e-12)
         reach = distances[:, self._k :].clamp_max(FARTHEST * self._radius)
-        # where there is no next one, 1 / d²
-        weights = torch.where(reach.isfinite(), (reach / near - 1.0).clamp_min(0.0), 1.0 / near).square()
+        # where there is no next one, 1 / d
+        weights = torch.where(reach.isfinite(), (reach / near - 1.0).clamp_min(0.0), 1.0 / near)
         weights = weights * self._largest_part(nearest, weights > 0.0)
         sums = embedding_bag(nearest, self._embedded, per_sample_weights=weights, mode="sum")
         known = (distances[:, 0] <= self._radius) & (weights.sum(1) > 0.0)

@@ -62,9 +62,10 @@ class Solution:
 class Solver:
     """A roadmap's tables for guesses at any point. `Roadmap.solve` is what to call.
 
-    A guess is the circular average over the k nearest resolved vertices, weighted by (r / d − 1)², where r is the
-    distance of the next one. So weights are those of Algorithm 3, (max d / d)², but vanish where a vertex leaves the
-    set, and the guess does not jump: with the paper's, steps along dense lines reach five times the slope.
+    A guess is the circular average over the k nearest resolved vertices, weighted by r / d − 1, where r is the distance
+    of the next one. Like those of Algorithm 3, (max d / d)², these weights make it the vertex's configuration at a
+    vertex; but they vanish where a vertex leaves the set, so the guess does not jump, and it is less flat round each
+    vertex and less steep between them.
     """
 
     def __init__(self, roadmap: Roadmap) -> None:
