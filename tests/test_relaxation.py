@@ -120,7 +120,7 @@ def test_what_is_beyond_the_bound_costs_the_bound_and_does_not_pull(whole, gener
 @pytest.mark.parametrize("every_cell_each_round", [False, True])
 def test_certification_certifies_more_cells(planar_5, monkeypatch, every_cell_each_round):
     if every_cell_each_round:
-        monkeypatch.setattr(certification, "_leeway", lambda spread, _: torch.zeros_like(spread))
+        monkeypatch.setattr(certification, "_leeway", lambda spread, *_: torch.zeros_like(spread))
     plain = grr_torch.build(planar_5, "fixed-rotation", points=400, refine=False)
     vertices = plain.resolved.nonzero()[:, 0]
     rank = torch.full_like(plain.resolved, -1, dtype=torch.long).index_put_((vertices,), torch.arange(len(vertices)))
@@ -141,7 +141,7 @@ def test_a_second_attempt_leaves_fewer_cells_uncertified(kinova, monkeypatch):
     attempt, given_up_from, left = certification._drawn_together, [], []
 
     def noted(*given):
-        given_up_from.append(given[4])
+        given_up_from.append(given[5])
         return attempt(*given)
 
     monkeypatch.setattr(certification, "_drawn_together", noted)
@@ -163,7 +163,7 @@ def test_cells_that_are_far_apart_are_left_alone(whole, generator):
 
 def test_what_may_have_to_be_drawn_together_is_measured_again():
     spread = torch.tensor([0.5, 0.93, 1.2, 1.4, 2.0, torch.inf])
-    torch.testing.assert_close(certification._leeway(spread, 1.4), torch.tensor([0.43, 0.0, 0.0, 0.0, 0.6, 0.0]))
+    torch.testing.assert_close(certification._leeway(spread, 0.93, 1.4), torch.tensor([0.43, 0.0, 0.0, 0.0, 0.6, 0.0]))
 
 
 def test_some_edges_are_judged_as_all_of_them_are(whole, generator):

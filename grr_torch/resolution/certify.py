@@ -23,11 +23,9 @@ from grr_torch.spaces.configuration import difference
 _ROUNDS = 18
 # cells with less spread are not looked at [rad]
 _SUSPECT = 0.6
-# spread that is aimed at [rad], and beyond which a cell is given up [rad]
-_AIM = 0.93
-_HOPELESS = 1.4
-# and in a second attempt, where more cells are left below this than between the two, which may hold those
-_HOPELESS_AGAIN = 1.1
+# in a first and a second attempt, spread that is aimed at [rad], and beyond which a cell is given up [rad]; the second
+# is for maps with more cells left below its limit than between the two limits: these may hold those
+_AIM, _HOPELESS = (0.93, 0.96), (1.4, 1.1)
 # cells of maps that are attempted twice: it takes long
 _MOST_TWICE = 65536
 # how much a pull counts against an edge of typical weight
@@ -65,8 +63,9 @@ def certify(
     looking, *stages = map(checkpoint.stage, names)
     robot, task, points = network.robot, network.task, network.targets.T
 
-    def attempt(hopeless: float, kept: Stage, looking_again: Stage) -> tuple[Tensor, Tensor]:
-        given = corners[suspects], spread[suspects], q, hopeless
+    def attempt(number: int) -> tuple[Tensor, Tensor]:
+        kept, looking_again = stages[2 * number : 2 * number + 2]
+        given = corners[suspects], spread[suspects], q, _AIM[number], _HOPELESS[number]
         moved = _drawn_together(network, *given, tolerances, progress, kept)
         # cells that were not looked at may have suffered, where their corners have moved far enough
         doubtful = ~(spread + _GROWTH * _way(network, corners, q, moved) <= LARGEST_SPREAD)
@@ -79,12 +78,12 @@ def certify(
         if len(left) == 0:
             return q
         suspects = spread > _SUSPECT
-        moved, found = attempt(_HOPELESS, *stages[:2])
+        moved, found = attempt(0)
         if len(found) < len(left):
             best, left = moved, found
-        near, farther = found <= _HOPELESS_AGAIN, (found > _HOPELESS_AGAIN) & (found <= _HOPELESS)
+        near, farther = found <= _HOPELESS[1], (found > _HOPELESS[1]) & (found <= _HOPELESS[0])
         if 0 < int(farther.sum()) < int(near.sum()) and len(corners) <= _MOST_TWICE:
-            moved, found = attempt(_HOPELESS_AGAIN, *stages[2:])
+            moved, found = attempt(1)
             if len(found) < len(left):
                 best = moved
     progress("certifying", _ROUNDS, _ROUNDS)
@@ -96,6 +95,7 @@ def _drawn_together(
     corners: Tensor,
     spread: Tensor,
     q: Tensor,
+    aim: float,
     hopeless: float,
     tolerances: Tolerances,
     progress: Progress,
@@ -119,7 +119,7 @@ def _drawn_together(
     for done in range(begin, _ROUNDS + 1):
         progress("certifying", done, _ROUNDS)
         # the others will hardly have come to where they are pulled, or no longer are
-        again = (2.0 * travelled >= _leeway(spread, hopeless)).nonzero()[:, 0]
+        again = (2.0 * travelled >= _leeway(spread, aim, hopeless)).nonzero()[:, 0]
         spread[again], pairs, apart = _spread(network, corners[again], q, tolerances)
         travelled[again] = 0.0
         uncertified = int((spread > LARGEST_SPREAD).sum())
@@ -129,7 +129,7 @@ def _drawn_together(
         if waited == _PATIENCE and sacrifices < _SACRIFICES:
             given_up |= _worst_of_neighbours(network, corners, spread, hopeless)
             sacrifices, waited = sacrifices + 1, 0
-        excess = (apart.square().sum(0).sqrt() - _AIM).clamp_min(0.0)
+        excess = (apart.square().sum(0).sqrt() - aim).clamp_min(0.0)
         pulled = ((excess > 0.0) & ((spread <= hopeless) & ~given_up)[again].repeat(3)).nonzero()[:, 0]
         numbers = {"fewest": fewest, "before": before, "waited": waited, "sacrifices": sacrifices}
         watched = {"given_up": given_up, "spread": spread, "travelled": travelled}
@@ -137,7 +137,7 @@ def _drawn_together(
             kept.keep(_state(q, best, watched, {**numbers, "done": done, "ended": True}), last=True)
             break
         # only what is beyond the aim is drawn in
-        share = excess[pulled] / (excess[pulled] + _AIM)
+        share = excess[pulled] / (excess[pulled] + aim)
         pulls = Pulls(pairs[:, pulled], apart[:, pulled] * share, torch.full_like(share, weight * (1 + done)))
         moved = move(network, q, gauss_newton_step(network, q, _DAMPING, pulls), tolerances)
         travelled += _way(network, corners, q, moved)
@@ -152,9 +152,9 @@ def _way(network: Network, corners: Tensor, q: Tensor, moved: Tensor) -> Tensor:
     return way[corners].amax(1)
 
 
-def _leeway(spread: Tensor, hopeless: float) -> Tensor:
+def _leeway(spread: Tensor, aim: float, hopeless: float) -> Tensor:
     """How much the spread of cells (C,) would have to change to be drawn together, or not any more [rad]."""
-    leeway = torch.maximum(_AIM - spread, spread - hopeless).clamp_min(0.0)
+    leeway = torch.maximum(aim - spread, spread - hopeless).clamp_min(0.0)
     # of a cell that could not be followed to its centre nothing is known
     return torch.where(spread.isinf(), 0.0, leeway)
 
