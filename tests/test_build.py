@@ -162,7 +162,7 @@ def test_only_seeds_that_were_given_are_warned_of(planar_5, monkeypatch):
     with pytest.warns(GrrWarning, match="1 of 2 seeds are not used"):
         given = grr_torch.build(robot, "position", points=50, seeds=beyond, refine=False)
     # the package's `build` is the function
-    module = importlib.import_module("grr_torch.resolution.build")
+    module = importlib.import_module("grr_torch.resolution.methods")
     monkeypatch.setattr(module, "find_seeds", lambda *_, **__: beyond)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

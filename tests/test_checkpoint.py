@@ -125,7 +125,7 @@ def equal_files(path, roadmap):
 
 def test_a_finished_build_succeeds_at_once(planar_5, tmp_path, monkeypatch):
     first = grr_torch.build(planar_5, "position", points=150, checkpoint=tmp_path)
-    monkeypatch.setattr("grr_torch.resolution.build.expand", None)
+    monkeypatch.setattr("grr_torch.resolution.methods.expand", None)
     monkeypatch.setattr("grr_torch.resolution.cells.lead_to_centres", None)
     again = grr_torch.build(planar_5, "position", points=150, checkpoint=tmp_path, resume=True)
     assert torch.equal(again.configurations.nan_to_num(9.9), first.configurations.nan_to_num(9.9))

@@ -19,7 +19,7 @@ def test_what_is_free_is_less_than_the_machine_has():
 
 def test_a_build_that_will_not_fit_is_refused_before_it_starts(kinova, monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 300 << 20)
-    monkeypatch.setattr("grr_torch.resolution.build.expand", None)
+    monkeypatch.setattr("grr_torch.resolution.methods.expand", None)
     with pytest.raises(ParameterError, match=r"points: got .* vertices, which would take about .* GiB") as caught:
         grr_torch.build(kinova, "position", points=300_000)
     assert "0.3 GiB that are free" in caught.value.valid

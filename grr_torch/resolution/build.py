@@ -7,23 +7,21 @@ import warnings
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from grr_torch.errors import GrrWarning, ParameterError
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances
-from grr_torch.resolution.auto_seeds import CANDIDATES, find_seeds
+from grr_torch.resolution.auto_seeds import CANDIDATES
 from grr_torch.resolution.checkpoint import Checkpoint
-from grr_torch.resolution.edges import EdgeCheck, continuous_edges
-from grr_torch.resolution.expand import default_neighbours, expand
+from grr_torch.resolution.edges import EdgeCheck
 from grr_torch.resolution.memory import require_memory
+from grr_torch.resolution.methods import Parts, Work, at_random, by_expansion
 from grr_torch.resolution.options import bounded, check_options, describe_build
 from grr_torch.resolution.problem import Problem, pose_problem
-from grr_torch.resolution.random_grr import random_grr
 from grr_torch.resolution.reachability import measure_reachability
 from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
@@ -82,7 +80,7 @@ def build(
             at weight 1, 1 % of an objective's mean is worth 1 % of smoothness.
         max_slope: Edges with D_q / D_p above this [rad/m] are not connected, though continuous: there small moves of
             the hand are large ones of the arm. inf: no bound. By default that of the preset's grid, if it has
-            one and the method is expansion; otherwise none.
+            one and the method is expansion, raised at the end as far as the preset says; otherwise none.
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. On the CPU the same inputs give the same tensors.
         tolerances: When a configuration counts as being at a point.
@@ -113,6 +111,7 @@ def build(
         "refine": refine,
         "objectives": dict(objectives or {}),
         "max_slope": problem.max_slope,
+        "connectivity": problem.connectivity,
         "reachability": reachability,
         "seed": seed,
         "tolerances": asdict(tolerances),
@@ -126,14 +125,8 @@ def build(
             return load_roadmap(kept.roadmap, robot)
         require_memory(robot, problem, refine)
         with kept.timed("building"):
-            if method == "random":
-                parts = _at_random(robot, problem, samples, seed, tolerances, check, progress, kept)
-            else:
-                # where seeds are found, what from: they may be as many as the vertices
-                found = isinstance(problem.seeds, str)
-                seeded = _with_seeds(robot, problem, candidates, seed, tolerances, progress, kept)
-                parts = _expanded(robot, seeded, neighbours, tolerances, check, progress, kept, warn=not found)
-                parts.chosen.update({"seeds": "auto", "candidates": candidates} if found else {"seeds": _rows(problem)})
+            work = Work(robot, problem, seed, tolerances, check, progress, kept)
+            parts = at_random(work, samples) if method == "random" else by_expansion(work, neighbours, candidates)
         settings = {
             "margin": robot.margin,
             "seed": seed,
@@ -179,118 +172,7 @@ def _with_reachability(roadmap: Roadmap, tolerances: Tolerances, progress: Progr
     return replace(roadmap, reachable=reachable)
 
 
-class _Parts(NamedTuple):
-    """What a method finds.
-
-    Attributes:
-        configurations: (V, n), NaN where unresolved.
-        wave: (V,) when a vertex was resolved, −1 where unresolved.
-        connected: (E,) edges that are continuous.
-        chosen: The method's parameters.
-    """
-
-    configurations: Tensor
-    wave: Tensor
-    connected: Tensor
-    chosen: dict[str, Any]
-
-
-def _at_random(
-    robot: Robot,
-    problem: Problem,
-    samples: int,
-    seed: int,
-    tolerances: Tolerances,
-    check: EdgeCheck,
-    progress: Progress,
-    kept: Checkpoint,
-) -> _Parts:
-    def resolve() -> dict[str, Tensor]:
-        found = random_grr(
-            robot, problem.task, problem.graph, samples=samples, seed=seed, tolerances=tolerances, progress=progress
-        )
-        return {"configurations": found.configurations, "wave": found.wave}
-
-    found = kept.once("random", resolve)
-    connected = _checked(robot, problem, found["configurations"], found["wave"], tolerances, check, progress, kept)
-    return _Parts(**found, connected=connected, chosen={"samples": samples, "seeds": []})
-
-
-def _checked(
-    robot: Robot,
-    problem: Problem,
-    configurations: Tensor,
-    wave: Tensor,
-    tolerances: Tolerances,
-    check: EdgeCheck,
-    progress: Progress,
-    kept: Checkpoint,
-) -> Tensor:
-    """(E,) edges that are continuous."""
-    task, graph, stage = problem.task, problem.graph, kept.stage("edges")
-    found = graph.points, configurations, wave >= 0, graph.edges
-    return continuous_edges(robot, task, *found, tolerances, progress, stage, check)
-
-
-def _with_seeds(
-    robot: Robot,
-    problem: Problem,
-    candidates: int,
-    seed: int,
-    tolerances: Tolerances,
-    progress: Progress,
-    kept: Checkpoint,
-) -> Problem:
-    """The problem with seeds that are found, where none are given."""
-    if not isinstance(problem.seeds, str):
-        return problem
-
-    def find() -> dict[str, Tensor]:
-        what: dict[str, Any] = {"candidates": candidates, "seed": seed, "max_slope": problem.max_slope}
-        found = find_seeds(robot, problem.task, problem.graph, **what, tolerances=tolerances, progress=progress)
-        return {"seeds": found}
-
-    return problem._replace(seeds=kept.once("seeds", find)["seeds"].to(robot.device))
-
-
-def _expanded(
-    robot: Robot,
-    problem: Problem,
-    neighbours: int | None,
-    tolerances: Tolerances,
-    check: EdgeCheck,
-    progress: Progress,
-    kept: Checkpoint,
-    *,
-    warn: bool,
-) -> _Parts:
-    task, graph, table = problem[:3]
-    assert not isinstance(table, str)
-    expansion = expand(
-        robot,
-        task,
-        graph,
-        table,
-        neighbours=neighbours,
-        tolerances=tolerances,
-        progress=progress,
-        kept=kept.stage("expansion"),
-        warn=warn,
-    )
-    found = expansion.configurations, expansion.wave
-    connected = _checked(robot, problem, *found, tolerances, check, progress, kept)
-    chosen = {"neighbours": default_neighbours(task) if neighbours is None else neighbours}
-    return _Parts(expansion.configurations, expansion.wave, connected, chosen)
-
-
-def _rows(problem: Problem) -> list[list[float]]:
-    """Its seeds, as JSON."""
-    assert not isinstance(problem.seeds, str)
-    rows: list[list[float]] = torch.as_tensor(problem.seeds, dtype=torch.float64).tolist()
-    return rows
-
-
-def _assemble(robot: Robot, problem: Problem, parts: _Parts, parameters: dict[str, Any], seconds: float) -> Roadmap:
+def _assemble(robot: Robot, problem: Problem, parts: Parts, parameters: dict[str, Any], seconds: float) -> Roadmap:
     points = problem.graph.points
     box = torch.stack([points.amin(0), points.amax(0)], dim=1).tolist()
     return Roadmap(
