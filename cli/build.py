@@ -80,7 +80,7 @@ def build(
         float | None,
         typer.Option(
             help="Leave out edges whose D_q / D_p is above this, in rad/m, and have info list them; inf: none. "
-            "By default that of the preset's grid, if it has one; otherwise inf."
+            "By default that of the preset's grid, which refinement may raise, if it has one; otherwise inf."
         ),
     ] = None,
     reachability: Annotated[

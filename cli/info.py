@@ -42,7 +42,7 @@ def info(
     from grr_torch.resolution.quality import Quality
     from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.roadmap_file import load_roadmap, read_file
-    from grr_torch.resolution.slopes import left_out_edges, steep_edges
+    from grr_torch.resolution.slopes import left_out_edges, slope_bound, steep_edges
     from grr_torch.resolution.verify import verify_file
 
     if max_slope is not None and not max_slope > 0.0:
@@ -102,7 +102,7 @@ def info(
         if len(steep):
             print_rows(f"{len(steep)} steep edges, the steepest first", _steep_rows(roadmap, steep[:_LISTED]))
         if len(left_out):
-            limit = roadmap.parameters["max_slope"]
+            limit = slope_bound(roadmap)
             title = f"{len(left_out)} edges left out, steeper than {limit:g} rad/m, the steepest first"
             print_rows(title, _steep_rows(roadmap, left_out[:_LISTED]))
         if checks:

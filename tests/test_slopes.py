@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import grr_torch
-from grr_torch.errors import ParameterError
+from grr_torch.errors import FileFormatError, ParameterError
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.options import bounded
 from grr_torch.resolution.problem import pose_problem
@@ -18,6 +18,7 @@ from grr_torch.resolution.repair import repair
 from grr_torch.resolution.slopes import (
     edge_slopes,
     left_out_edges,
+    slope_bound,
     steep_edges,
     with_raised_bound,
     without_steep_edges,
@@ -109,11 +110,13 @@ def test_the_preset_bounds_its_own_grid_alone(kinova):
         "none": grr_torch.build(kinova, "position", refine=False, max_slope=math.inf),
     }
     found = {name: roadmap.parameters["max_slope"] for name, roadmap in bounds.items()}
-    own = found.pop("of the preset")
-    assert own >= kinova.preset.problems["position"].max_slope
-    assert found == {"other points": None, "other task": None, "given": 10.0, "none": None}
+    preset = kinova.preset.problems["position"]
+    own = {"of the preset": preset.max_slope}
+    assert found == {**own, "other points": None, "other task": None, "given": 10.0, "none": None}
+    shares = [roadmap.parameters["connectivity"] for roadmap in bounds.values()]
+    assert shares == [preset.connectivity, None, None, None, None]
     whole, left = bounds["none"], bounds["of the preset"]
-    assert torch.equal(left.connected, whole.connected.index_fill(0, steep_edges(whole, own), False))
+    assert torch.equal(left.connected, whole.connected.index_fill(0, steep_edges(whole, preset.max_slope), False))
 
 
 @pytest.mark.parametrize("task", ["position", "fixed-rotation"])
@@ -121,28 +124,55 @@ def test_of_the_preset_s_grids_nearly_all_edges_are_left_and_lie_within_the_boun
     roadmap, problem = grr_torch.build(kinova, task), kinova.preset.problems[task]
     connected = int(roadmap.connected.sum()) / int(roadmap.resolved[roadmap.edges].all(1).sum())
     assert connected >= (problem.connectivity or 0.995)
-    assert roadmap.quality().smoothness_max <= roadmap.parameters["max_slope"]
+    assert roadmap.quality().smoothness_max <= slope_bound(roadmap)
+    assert slope_bound(roadmap) >= roadmap.parameters["max_slope"] == problem.max_slope
 
 
 @pytest.mark.parametrize("connectivity", [0.0, 0.9, 0.97, 1.0])
 def test_the_bound_is_raised_as_far_as_so_many_edges_take_it_and_no_further(pair, tmp_path, connectivity):
     free, bounded = pair
-    raised = with_raised_bound(bounded, connectivity)
+    asked = replace(bounded, parameters={**bounded.parameters, "connectivity": connectivity})
+    raised = with_raised_bound(asked)
     between = int(bounded.resolved[bounded.edges].all(1).sum())
     wanted = min(int(free.connected.sum()), math.ceil(connectivity * between))
-    bound, slopes = raised.parameters["max_slope"], edge_slopes(raised)
+    bound, slopes = slope_bound(raised), edge_slopes(raised)
     assert len(slopes) >= wanted
-    assert raised is bounded or int((slopes < bound - 1e-3).sum()) < wanted
+    assert (raised is asked) == (wanted <= int(bounded.connected.sum()))
+    assert raised is asked or int((slopes < bound - 1e-3).sum()) < wanted
     assert bool(raised.connected[bounded.connected].all())
     assert torch.equal(raised.connected, without_steep_edges(replace(free, parameters=raised.parameters)).connected)
-    assert (raised is bounded) == (wanted <= int(bounded.connected.sum()))
+    assert bool((edge_slopes(raised, left_out_edges(raised)) > bound).all())
     raised.save(tmp_path / "m.grr")
     assert all(check.passed for check in verify_file(tmp_path / "m.grr"))
 
 
-def test_a_map_without_a_bound_has_none_to_raise(pair):
-    free, _ = pair
-    assert with_raised_bound(free, 1.0) is free
+def test_a_map_without_a_bound_or_a_share_has_none_to_raise(pair):
+    free, bounded = pair
+    asked = replace(free, parameters={**free.parameters, "connectivity": 1.0})
+    assert with_raised_bound(asked) is asked
+    assert with_raised_bound(bounded) is bounded
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_refining_raises_the_bound_and_so_does_a_build(tmp_path, dtype):
+    robot = grr_torch.load_robot("kinova", dtype=dtype)
+    plain, built = (grr_torch.build(robot, "position", refine=refined) for refined in (False, True))
+    assert slope_bound(plain) == plain.parameters["max_slope"] < slope_bound(built)
+    refined = refine(plain)
+    assert refined.parameters == {**built.parameters, "refinement": refined.parameters["refinement"]}
+    assert torch.equal(refined.connected, built.connected)
+    again = refine(built)
+    assert bool(again.connected[built.connected].all())
+    assert slope_bound(again) >= slope_bound(built)
+    built.save(tmp_path / "m.grr")
+    assert all(check.passed for check in verify_file(tmp_path / "m.grr"))
+
+
+def test_a_bound_that_is_given_is_another_build_than_the_preset_s(kinova, tmp_path):
+    grr_torch.build(kinova, "position", refine=False, checkpoint=tmp_path / "kept")
+    bound = kinova.preset.problems["position"].max_slope
+    with pytest.raises(FileFormatError):
+        grr_torch.build(kinova, "position", refine=False, checkpoint=tmp_path / "kept", resume=True, max_slope=bound)
 
 
 def test_the_bound_of_the_preset_is_for_expansions_that_are_not_told_otherwise(kinova):
@@ -169,8 +199,8 @@ def test_the_command_takes_the_bound_of_the_preset(kinova, run_cli, given, has_o
     words = ["build", "--robot", "kinova", "--task", "position", "--no-refine", "--out", "m.grr", "--no-record"]
     code, _, _ = run_cli(*words, *given)
     assert code == 0
-    found = grr_torch.Roadmap.load("m.grr").parameters["max_slope"]
-    assert (found is not None and found >= kinova.preset.problems["position"].max_slope) if has_one else found is None
+    expected = kinova.preset.problems["position"].max_slope if has_one else None
+    assert grr_torch.Roadmap.load("m.grr").parameters["max_slope"] == expected
 
 
 def test_a_last_repair_moves_nothing_for_edges_that_are_left_out(pair):

@@ -52,7 +52,8 @@ _FINAL_ROUNDS = 3
 _LAST_ROUNDS = 10
 # edges steeper than this many times the median do not pull, and count as that steep, where there is no bound of slopes
 _STEEP = 6.0
-# an edge that is missing, broken, or steeper, counts as this many times the smallest median of slopes
+# an edge that is missing, broken, or steeper, counts as this many times the smallest median of slopes; where there is a
+# bound, one that is broken or steeper counts as that
 _MISSING = 40.0
 # edges less steep than this many times the median are hardly ever broken
 _SUSPECT = 3.0
@@ -87,7 +88,8 @@ def find_seeds(
         graph: The task graph that will be expanded; a coarser one over its bounds is tried out first.
         candidates: How many sets of seeds are compared.
         seed: Of all random draws.
-        max_slope: Slope [rad/m] above which edges are to be left out; None: no bound.
+        max_slope: Slope [rad/m] above which edges are to be left out; None: no bound. It counts where maps of the graph
+            itself are tried.
         tolerances: Of the projections.
         progress: Told what is being done and how far it is.
 

@@ -27,7 +27,7 @@ from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.roadmap_file import load_roadmap
 from grr_torch.resolution.seeds import SeedsLike
-from grr_torch.resolution.slopes import with_raised_bound, without_steep_edges
+from grr_torch.resolution.slopes import without_steep_edges
 from grr_torch.robots.crowding import crowding
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph
@@ -80,7 +80,7 @@ def build(
             at weight 1, 1 % of an objective's mean is worth 1 % of smoothness.
         max_slope: Edges with D_q / D_p above this [rad/m] are not connected, though continuous: there small moves of
             the hand are large ones of the arm. inf: no bound. By default that of the preset's grid, if it has
-            one and the method is expansion, raised at the end as far as the preset says; otherwise none.
+            one and the method is expansion, which refinement raises at its end as far as the preset says.
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. On the CPU the same inputs give the same tensors.
         tolerances: When a configuration counts as being at a point.
@@ -131,6 +131,7 @@ def build(
             "margin": robot.margin,
             "seed": seed,
             "max_slope": problem.max_slope,
+            "connectivity": problem.connectivity,
             "reachability": reachability,
             "tolerances": asdict(tolerances),
         }
@@ -144,8 +145,6 @@ def build(
             roadmap = refine_roadmap(
                 roadmap, objectives=objectives, seed=seed, check=check, progress=progress, checkpoint=kept
             )
-        if problem.connectivity is not None:
-            roadmap = with_raised_bound(roadmap, problem.connectivity)
         if reachability:
             roadmap = _with_reachability(roadmap, tolerances, progress, kept)
         if kept.folder is not None:

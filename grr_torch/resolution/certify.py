@@ -13,7 +13,7 @@ from torch import Tensor
 
 from grr_torch.pieces import one_thread, together
 from grr_torch.processes import at_once
-from grr_torch.progress import Progress
+from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.cells import CELLS_AT_ONCE, LARGEST_SPREAD, lead_to_centres, spreads
 from grr_torch.resolution.checkpoint import Checkpoint, Stage
@@ -65,11 +65,14 @@ def certify(
 
     def attempt(number: int) -> tuple[Tensor, Tensor]:
         kept, looking_again = stages[2 * number : 2 * number + 2]
+        # the time left is told as if there were no second attempt
+        told = silent if number else progress
         given = corners[suspects], spread[suspects], q, _AIM[number], _HOPELESS[number]
-        moved = _drawn_together(network, *given, tolerances, progress, kept)
+        moved = _drawn_together(network, *given, tolerances, told, kept)
+        told("certifying", _ROUNDS, _ROUNDS)
         # cells that were not looked at may have suffered, where their corners have moved far enough
         doubtful = ~(spread + _GROWTH * _way(network, corners, q, moved) <= LARGEST_SPREAD)
-        again = spreads(robot, task, points, moved.T, corners[doubtful], tolerances, progress, looking_again)
+        again = spreads(robot, task, points, moved.T, corners[doubtful], tolerances, told, looking_again)
         return moved, again[again > LARGEST_SPREAD]
 
     with one_thread(), torch.no_grad():
@@ -86,7 +89,6 @@ def certify(
             moved, found = attempt(1)
             if len(found) < len(left):
                 best = moved
-    progress("certifying", _ROUNDS, _ROUNDS)
     return best
 
 

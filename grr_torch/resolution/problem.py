@@ -29,7 +29,7 @@ class Problem(NamedTuple):
         graph: Its task graph.
         seeds: A table of configurations, or "auto".
         max_slope: D_q / D_p above which edges are left out unless told otherwise [rad/m]; None: no bound.
-        connectivity: Share of the edges for which that bound is raised, if fewer keep it; None: for none.
+        connectivity: Share of the edges for which refinement raises that bound, if fewer keep it; None: for none.
     """
 
     task: TaskSpace
@@ -173,8 +173,9 @@ def _complete(
         graph = _turned(task, graph, rotations, problem)
     if graph.points.shape[1] != task.width:
         raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.width} for {task.name}")
-    bounds_of_slopes = (problem.max_slope, problem.connectivity) if problem and _is_grid_of(graph, problem) else ()
-    return Problem(task, graph, seeds, *bounds_of_slopes)
+    if problem is None or problem.max_slope is None or not _is_grid_of(graph, problem):
+        return Problem(task, graph, seeds)
+    return Problem(task, graph, seeds, problem.max_slope, problem.connectivity)
 
 
 def _is_grid_of(graph: TaskGraph, problem: Preset) -> bool:

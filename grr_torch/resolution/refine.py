@@ -21,7 +21,7 @@ from grr_torch.resolution.relax import Network, relax
 from grr_torch.resolution.repair import repair
 from grr_torch.resolution.report import before_refinement
 from grr_torch.resolution.roadmap import Roadmap
-from grr_torch.resolution.slopes import edge_slopes, without_steep_edges
+from grr_torch.resolution.slopes import edge_slopes, with_raised_bound, without_steep_edges
 
 # of an objective's scale: no arm is at a singularity or a limit everywhere
 _LEAST_SCALE = 1e-9
@@ -43,7 +43,8 @@ def refine(
     where the relaxed map breaks an edge, its ends go back part of the way, or to where they were. Edges that are broken
     then are tried once more, in all but large maps; what joins them may be steep. With objectives, the
     smoothest map is then relaxed once more, for the sum that `grr_torch.resolution.objectives` gives. At last, edges
-    steeper than the roadmap's parameter `max_slope`, if it has one, are left out.
+    steeper than the roadmap's parameter `max_slope`, if it has one, are left out, but for those that its parameter
+    `connectivity`, if it has that, takes.
 
     Args:
         roadmap: The roadmap.
@@ -81,7 +82,8 @@ def refine(
             for name, weight in weights.items()
         }
     parameters = {**roadmap.parameters, "refinement": told}
-    return without_steep_edges(replace(refined, parameters=parameters, build_seconds=roadmap.build_seconds + seconds))
+    refined = replace(refined, parameters=parameters, build_seconds=roadmap.build_seconds + seconds)
+    return with_raised_bound(without_steep_edges(refined))
 
 
 def _figures(roadmap: Roadmap, objective: str) -> dict[str, float | None]:

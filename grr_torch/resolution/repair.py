@@ -162,7 +162,7 @@ def _unresolved_at_the_rim(roadmap: Roadmap) -> Tensor:
 
 
 def _reconsider(roadmap: Roadmap, vertices: Tensor, starts: int, means: _Means) -> Roadmap:
-    """Gives some vertices, no two of them neighbours, the candidate whose edges cost least, if they cost less."""
+    """Gives some vertices, no two of them neighbours, the candidates that `_choose` chooses."""
     candidates = _candidates(roadmap, _independent(roadmap, vertices), starts, means)
     if len(candidates.vertices) == 0:
         return roadmap

@@ -49,13 +49,21 @@ def steep_edges(roadmap: Roadmap, max_slope: float | None = None) -> Tensor:
     return roadmap.connected.nonzero()[:, 0][steep[slopes[steep].argsort(descending=True)]]
 
 
-def left_out_edges(roadmap: Roadmap) -> Tensor:
-    """Indices (K,) of edges that are not connected because they are steeper than what the roadmap was built with.
+def slope_bound(roadmap: Roadmap) -> float | None:
+    """The slope above which edges of a roadmap are left out [rad/m]; None: it has no such bound.
 
-    Steeper than its `max_slope`, that is; the steepest first, and none if it has no such bound. Some of them may
-    not be continuous either.
+    Its parameter `max_slope`, or what `with_raised_bound` has raised that to.
     """
-    limit = roadmap.parameters.get("max_slope")
+    bound: float | None = roadmap.parameters.get("raised_slope") or roadmap.parameters.get("max_slope")
+    return bound
+
+
+def left_out_edges(roadmap: Roadmap) -> Tensor:
+    """Indices (K,) of edges that are not connected because they are steeper than the roadmap's bound.
+
+    The steepest first, and none if it has no bound. Some of them may not be continuous either.
+    """
+    limit = slope_bound(roadmap)
     if limit is None:
         return torch.empty(0, dtype=torch.long)
     edges = (roadmap.resolved[roadmap.edges].all(1) & ~roadmap.connected).nonzero()[:, 0]
@@ -65,8 +73,8 @@ def left_out_edges(roadmap: Roadmap) -> Tensor:
 
 
 def without_steep_edges(roadmap: Roadmap) -> Roadmap:
-    """The roadmap whose edges steeper than its parameter `max_slope` [rad/m], if it has one, are not connected."""
-    limit = roadmap.parameters.get("max_slope")
+    """The roadmap whose edges steeper than its bound, if it has one, are not connected."""
+    limit = slope_bound(roadmap)
     if limit is None:
         return roadmap
     connected = roadmap.connected.clone()
@@ -75,41 +83,40 @@ def without_steep_edges(roadmap: Roadmap) -> Roadmap:
 
 
 def within_bound(roadmap: Roadmap, edges: Tensor) -> Tensor:
-    """(E,) edges (E, 2) that are not steeper than the roadmap's parameter `max_slope`; all, if it has none."""
-    limit = roadmap.parameters.get("max_slope")
+    """(E,) edges (E, 2) that are not steeper than the roadmap's bound; all, if it has none."""
+    limit = slope_bound(roadmap)
     if limit is None:
         return torch.ones(len(edges), dtype=torch.bool)
     return _slopes(roadmap, edges) <= limit
 
 
-def with_raised_bound(roadmap: Roadmap, connectivity: float) -> Roadmap:
-    """The roadmap with its parameter `max_slope` as high as this share of its edges takes, if it is lower.
+def with_raised_bound(roadmap: Roadmap) -> Roadmap:
+    """The roadmap with its bound raised as far as its parameter `connectivity` takes, if it has one.
 
-    The least steep of the edges that were left out are connected, as far as they are continuous. Of edges that just
-    keep a bound while a map is relaxed, each holds its ends where the others suffer; so the bound is raised at the end.
-
-    Args:
-        roadmap: The roadmap.
-        connectivity: Connected edges by edges between resolved vertices.
+    That is the share of the edges between resolved vertices that are to be connected. The least steep of those that
+    were left out are, as far as they are continuous; where that is not enough, all of them. Of edges that just keep a
+    bound while a map is refined, each holds its ends where the others suffer; so the bound is raised at the end.
     """
-    limit = roadmap.parameters.get("max_slope")
+    share = roadmap.parameters.get("connectivity")
     between = int(roadmap.resolved[roadmap.edges].all(1).sum())
-    missing = math.ceil(connectivity * between) - int(roadmap.connected.sum())
+    # not one more where the product is rounded up
+    missing = math.ceil((share or 0.0) * between - 1e-6) - int(roadmap.connected.sum())
     left_out = torch.zeros_like(roadmap.connected)
     left_out[left_out_edges(roadmap)] = True
-    if limit is None or missing <= 0 or not bool(left_out.any()):
+    if missing <= 0 or not bool(left_out.any()):
         return roadmap
     continuous = check_edges(roadmap, Tolerances(**roadmap.parameters["tolerances"]), wanted=left_out)
     slopes = edge_slopes(roadmap, continuous).sort().values[:missing]
     if len(slopes) == 0:
         return roadmap
-    limit = math.ceil(float(slopes[-1]) * 10**_DECIMALS) / 10**_DECIMALS
-    raised = replace(roadmap, parameters={**roadmap.parameters, "max_slope": limit})
+    bound = math.ceil(float(slopes[-1]) * 10**_DECIMALS) / 10**_DECIMALS
+    raised = replace(roadmap, parameters={**roadmap.parameters, "raised_slope": bound})
     return replace(raised, connected=roadmap.connected | (continuous & within_bound(raised, raised.edges)))
 
 
 def _slopes(roadmap: Roadmap, edges: Tensor) -> Tensor:
     first, second = edges.T
     q, points = roadmap.configurations, roadmap.points
-    moved = distance(q[first], q[second], roadmap.robot.continuous.cpu())
+    # in double precision, as in files, whatever the robot computes in
+    moved = distance(q[first].double(), q[second].double(), roadmap.robot.continuous.cpu())
     return moved / roadmap.task.distance(points[first], points[second])

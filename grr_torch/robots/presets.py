@@ -22,7 +22,7 @@ class Problem:
         rotation: Fixed-axis roll, pitch, yaw of the tool [rad], for `fixed-rotation`, and for `yaw` at yaw 0.
         rotations: How many rotations the grid has, where rotation varies.
         max_slope: D_q / D_p above which edges of this very grid are left out [rad/m]; None: no bound.
-        connectivity: Share of the edges for which that bound is raised, if fewer keep it; None: for none.
+        connectivity: Share of the edges for which refinement raises that bound, if fewer keep it; None: for none.
     """
 
     points: int

@@ -1,0 +1,84 @@
+"""Which candidates a repair takes, by what their edges would cost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import grr_torch
+from grr_torch.projection.project import Tolerances
+from grr_torch.resolution import auto_seeds
+from grr_torch.resolution.repair import _Candidates, _choose, _resolved_around, _Trial
+from grr_torch.resolution.slopes import edge_slopes
+
+
+@pytest.fixture(scope="module")
+def whole(planar_5) -> grr_torch.Roadmap:
+    roadmap = grr_torch.build(planar_5, grr_torch.Position(2), points=60, bounds=[(-0.3, 0.3)] * 2, seeds="auto")
+    assert bool(roadmap.connected.all())
+    return roadmap
+
+
+def with_broken_edge(roadmap: grr_torch.Roadmap, vertex: int, bound: float | None) -> grr_torch.Roadmap:
+    """One edge of a vertex is not connected, though it could be."""
+    edges = (roadmap.edges == vertex).any(1).nonzero()[:, 0]
+    connected = roadmap.connected.index_fill(0, edges[:1], False)
+    return replace(roadmap, connected=connected, parameters={**roadmap.parameters, "max_slope": bound})
+
+
+def trial_of(roadmap: grr_torch.Roadmap, vertices: torch.Tensor, steepness: list[float]) -> _Trial:
+    """All edges of candidates join, and each is so many times as steep as the vertex's own."""
+    rank, ends = _resolved_around(roadmap, vertices, roadmap.graph)
+    edges = roadmap.graph.edge_between(vertices[rank], ends)
+    slopes = edge_slopes(roadmap, edges) * torch.tensor(steepness, dtype=torch.float64)[rank]
+    return _Trial(rank, edges, slopes, torch.ones_like(rank, dtype=torch.bool))
+
+
+def chosen(
+    roadmap: grr_torch.Roadmap, vertices: list[int], steepness: list[float], lost: int | None = None
+) -> list[int]:
+    candidates = _Candidates(torch.tensor(vertices), roadmap.configurations[vertices])
+    trial = trial_of(roadmap, candidates.vertices, steepness)
+    if lost is not None:
+        keeps = roadmap.connected[trial.edges] & (trial.rank == lost)
+        trial.joined[keeps.nonzero()[0]] = False
+    return _choose(roadmap, candidates, trial).tolist()
+
+
+def test_an_edge_is_worth_as_much_as_the_bound_that_it_is_left_out_by(whole):
+    vertex = 30
+    slopes = edge_slopes(whole, (whole.edges == vertex).any(1))
+    bound = 2.0 * float(slopes.max())
+    # to connect it costs this much more by the others, in all
+    for extra, taken in ((0.5, True), (1.5, False)):
+        steepness = 1.0 + (extra * bound - float(slopes[0])) / float(slopes.sum())
+        assert chosen(with_broken_edge(whole, vertex, bound), [vertex], [steepness]) == ([0] if taken else [])
+        # without a bound any price is paid
+        assert chosen(with_broken_edge(whole, vertex, None), [vertex], [steepness]) == [0]
+
+
+@pytest.mark.parametrize("bound", [None, 1000.0])
+def test_the_cheapest_is_taken_of_equal_ones_the_first_and_none_that_loses_or_gains_no_edge(whole, bound):
+    broken = with_broken_edge(whole, 30, bound)
+    assert chosen(broken, [30, 30, 30], [1.2, 1.1, 1.3]) == [1]
+    assert chosen(broken, [30, 30, 30], [1.2, 1.1, 1.1]) == [1]
+    assert chosen(broken, [30, 30], [1.2, 0.1], lost=1) == [0]
+    assert chosen(replace(broken, connected=whole.connected), [30], [0.1]) == []
+
+
+@pytest.mark.parametrize("max_slope", [14.8, None])
+def test_found_seeds_are_relaxed_within_the_bound_that_a_build_has(kinova, monkeypatch, max_slope):
+    relaxed, bounds = auto_seeds._relaxed, []
+
+    def noted(*given):
+        bounds.append(given[6] if len(given) > 6 else None)
+        return relaxed(*given)
+
+    monkeypatch.setattr(auto_seeds, "_relaxed", noted)
+    monkeypatch.setattr(auto_seeds, "at_once", lambda function, parts, _: map(function, parts))
+    options = {"points": 300, "seeds": "auto", "candidates": 40, "refine": False, "tolerances": Tolerances()}
+    grr_torch.build(kinova, "position", max_slope=max_slope, **options)
+    # on the coarse graph, of each finalist, and of the best of them
+    assert bounds == [None, max_slope, max_slope, max_slope]
