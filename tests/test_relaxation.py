@@ -11,7 +11,6 @@ import grr_torch
 from grr_torch.progress import silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import Tolerances, project
-from grr_torch.resolution import certify as certification
 from grr_torch.resolution.auto_seeds import find_seeds
 from grr_torch.resolution.blend import blended as blend
 from grr_torch.resolution.cells import spreads
@@ -19,7 +18,6 @@ from grr_torch.resolution.certify import certify
 from grr_torch.resolution.checkpoint import UNKEPT
 from grr_torch.resolution.edges import check_edges, continuous_edges
 from grr_torch.resolution.hops import _choose, hop
-from grr_torch.resolution.refine import _network, refine
 from grr_torch.resolution.relax import Network, gauss_newton_step, relax
 from grr_torch.resolution.repair import repair
 from grr_torch.spaces.configuration import distance
@@ -115,55 +113,6 @@ def test_what_is_beyond_the_bound_costs_the_bound_and_does_not_pull(whole, gener
     assert float((steps[0] - steps[2]).abs().max()) > 0.1
     relaxed = relax(bounded, q, Tolerances(), silent)
     assert float(bounded.costs(relaxed)) < float(bounded.costs(q))
-
-
-@pytest.mark.parametrize("every_cell_each_round", [False, True])
-def test_certification_certifies_more_cells(planar_5, monkeypatch, every_cell_each_round):
-    if every_cell_each_round:
-        monkeypatch.setattr(certification, "_leeway", lambda spread, *_: torch.zeros_like(spread))
-    plain = grr_torch.build(planar_5, "fixed-rotation", points=400, refine=False)
-    vertices = plain.resolved.nonzero()[:, 0]
-    rank = torch.full_like(plain.resolved, -1, dtype=torch.long).index_put_((vertices,), torch.arange(len(vertices)))
-    net = _network(plain, vertices, rank[plain.edges[plain.connected]], {})
-    cells = rank[plain.graph.triangles(plain.connected)]
-
-    def uncertified(q):
-        return int((spreads(planar_5, plain.task, net.targets.T, q, cells, Tolerances()) > 1.0).sum())
-
-    q = plain.configurations[vertices]
-    moved = certify(net, cells, q.T.contiguous(), Tolerances(), silent).T
-    assert uncertified(moved) <= 0.8 * uncertified(q)
-    position = planar_5.forward_kinematics(moved)[0][:, :2]
-    assert float((position - net.targets.T).norm(dim=1).max()) <= 1e-4
-
-
-def test_a_second_attempt_leaves_fewer_cells_uncertified(kinova, monkeypatch):
-    attempt, given_up_from, left = certification._drawn_together, [], []
-
-    def noted(*given):
-        given_up_from.append(given[5])
-        return attempt(*given)
-
-    monkeypatch.setattr(certification, "_drawn_together", noted)
-    for most in (0, 10**9):
-        monkeypatch.setattr(certification, "_MOST_TWICE", most)
-        quality = grr_torch.build(kinova, "position").quality()
-        left.append(quality.triangles_spread + quality.triangles_wound)
-    assert given_up_from == [1.4, 1.4, 1.1]
-    assert left[1] < left[0]
-
-
-def test_cells_that_are_far_apart_are_left_alone(whole, generator):
-    net, cells = network(whole), whole.graph.triangles(whole.connected)
-    q = spoilt(whole, 0.2, generator)[0]
-    apart = cells[spreads(whole.robot, whole.task, whole.points, q, cells, Tolerances()) > 1.5]
-    assert len(apart)
-    assert torch.equal(certify(net, apart, q.T.contiguous(), Tolerances(), silent), q.T)
-
-
-def test_what_may_have_to_be_drawn_together_is_measured_again():
-    spread = torch.tensor([0.5, 0.93, 1.2, 1.4, 2.0, torch.inf])
-    torch.testing.assert_close(certification._leeway(spread, 0.93, 1.4), torch.tensor([0.43, 0.0, 0.0, 0.0, 0.6, 0.0]))
 
 
 def test_some_edges_are_judged_as_all_of_them_are(whole, generator):
@@ -298,18 +247,9 @@ def test_a_relaxed_map_seeds_all_its_vertices(planar_5):
     assert int(roadmap.wave.max()) == 0
 
 
-def test_cells_that_are_not_measured_after_certification_are_certified(planar_5, monkeypatch):
-    plain, measured = grr_torch.build(planar_5, "pose", points=200, refine=False), []
-    whole = certification.spreads
-
-    def noted(*arguments):
-        measured.append((arguments, whole(*arguments)))
-        return measured[-1][1]
-
-    monkeypatch.setattr(certification, "spreads", noted)
-    refine(plain)
-    (before, spread), (after, again) = measured
-    assert 0 < len(again) < 0.3 * len(spread)
-    assert int((again > 1.0).sum()) == int((whole(*after[:4], before[4], *after[5:]) > 1.0).sum())
-    # some that were certified are not any more
-    assert len(again) > int((spread > 1.0).sum())
+def test_cells_that_are_far_apart_are_left_alone(whole, generator):
+    net, cells = network(whole), whole.graph.triangles(whole.connected)
+    q = spoilt(whole, 0.2, generator)[0]
+    apart = cells[spreads(whole.robot, whole.task, whole.points, q, cells, Tolerances()) > 1.5]
+    assert len(apart)
+    assert torch.equal(certify(net, apart, q.T.contiguous(), Tolerances(), silent), q.T)
