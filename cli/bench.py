@@ -97,6 +97,7 @@ def roadmap(
     reachability: Annotated[int, typer.Option(min=1, help="Random starts a vertex: which are reachable?")] = 40,
     samples: Annotated[int, typer.Option(min=1, help="Random configurations a vertex, for random.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
+    repeats: Annotated[int, typer.Option(min=1, help="Times are medians of so many; random is built once.")] = 3,
     json_file: FiguresFile = None,
 ) -> None:
     """Print the quality of the paper's four problems by every method, as a Markdown table.
@@ -111,7 +112,13 @@ def roadmap(
     check_outputs({"--json": json_file})
     with progress_bar() as progress:
         results = measure_roadmaps(
-            robots=robot, methods=method, reachability=reachability, samples=samples, seed=seed, progress=progress
+            robots=robot,
+            methods=method,
+            reachability=reachability,
+            samples=samples,
+            seed=seed,
+            repeats=repeats,
+            progress=progress,
         )
     write_figures(json_file, {"roadmaps": [result.to_dict() for result in results]})
     show_machine()

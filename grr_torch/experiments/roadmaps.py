@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from grr_torch.errors import UnknownNameError
+from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.progress import Progress, silent
 from grr_torch.resolution.build import build
 from grr_torch.resolution.quality import Quality
 from grr_torch.resolution.refine import refine
+from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.robots.load import load_robot
 
 PROBLEMS = tuple((robot, task) for robot in ("planar_5", "kinova") for task in ("position", "fixed-rotation"))
@@ -33,7 +35,8 @@ class Result:
         task: The kind of task.
         method: Of `METHODS`: random is Random-GRR, the others are Expansion-GRR with the seeds of that name.
         refined: Whether it was refined.
-        seconds: What it took: seeds, expansion, continuity of all edges, refinement.
+        seconds: What it took: seeds, expansion, continuity of all edges, refinement; the median of several builds, of
+            random one.
         quality: Its figures.
     """
 
@@ -76,6 +79,7 @@ def measure_roadmaps(
     reachability: int = 40,
     samples: int = 100,
     seed: int = 0,
+    repeats: int = 3,
     progress: Progress = silent,
 ) -> list[Result]:
     """Builds the four problems by every method, plain and refined.
@@ -86,11 +90,15 @@ def measure_roadmaps(
         reachability: Random starts a vertex that tell which are reachable.
         samples: Random configurations a vertex, for the method "random".
         seed: Of all random draws.
+        repeats: Times are medians of so many builds; random, which takes minutes, is built once.
         progress: Told which roadmap is built.
 
     Raises:
         UnknownNameError: No such robot or method.
+        ParameterError: `repeats` is below 1.
     """
+    if repeats < 1:
+        raise ParameterError("repeats", repeats, "1 or more")
     for name in methods or ():
         if name not in METHODS:
             raise UnknownNameError("method", name, METHODS)
@@ -99,19 +107,15 @@ def measure_roadmaps(
     results: list[Result] = []
     for index, (name, task, method) in enumerate(jobs):
         progress(f"{name} {task}, {method}", index, len(jobs))
+        options: dict[str, Any] = {"seeds": "auto" if method == "auto" else None, "samples": samples, "seed": seed}
+        options["method"] = "random" if method == "random" else "expansion"
         robot = load_robot(name)
-        plain = build(
-            robot,
-            task,
-            seeds="auto" if method == "auto" else None,
-            method="random" if method == "random" else "expansion",
-            samples=samples,
-            refine=False,
-            reachability=reachability,
-            seed=seed,
-        )
-        results.append(Result(name, task, method, False, plain.build_seconds, plain.quality()))
-        refined = refine(plain, seed=seed)
-        results.append(Result(name, task, method, True, refined.build_seconds, refined.quality()))
+        pairs: list[tuple[Roadmap, Roadmap]] = []
+        for _ in range(1 if method == "random" else repeats):
+            plain = build(robot, task, **options, refine=False, reachability=0 if pairs else reachability)
+            pairs.append((plain, refine(plain, seed=seed)))
+        for refined, roadmaps in enumerate(zip(*pairs, strict=True)):
+            seconds = statistics.median(roadmap.build_seconds for roadmap in roadmaps)
+            results.append(Result(name, task, method, bool(refined), seconds, roadmaps[0].quality()))
     progress("done", len(jobs), len(jobs))
     return results
