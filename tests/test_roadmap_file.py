@@ -133,6 +133,8 @@ def damage(saved, how):
         metadata["quality"] = "{}"
     elif how == "parameters":
         del metadata["parameters"]
+    elif how == "bound":
+        metadata["parameters"] = json.dumps({**json.loads(metadata["parameters"]), "raised_slope": "steep"})
     elif how == "missing":
         del tensors["wave"]
     elif how == "short":
@@ -156,6 +158,7 @@ DAMAGES = {
     "robot": "metadata without .urdf_directory.",
     "quality": "lacks the quality figures",
     "parameters": "metadata without 'parameters'",
+    "bound": "'raised_slope' is no number above 0",
     "missing": "lacks the tensors wave",
     "short": "'resolved' has",
     "dtype": "'points' is torch.float32",

@@ -18,6 +18,7 @@ from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.quality import Quality
 from grr_torch.resolution.report import check_refinement
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.slopes import check_slope_bound
 from grr_torch.robots.load import find_device, make_robot
 from grr_torch.robots.presets import load_preset, robot_names
 from grr_torch.robots.robot import Robot
@@ -107,6 +108,7 @@ def load_roadmap(
         longest = float(metadata["longest_edge"])
         Tolerances(**parameters["tolerances"])
         check_refinement(parameters)
+        check_slope_bound(parameters)
     except FileFormatError:
         raise
     except KeyError as error:

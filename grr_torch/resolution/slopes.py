@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -56,6 +57,18 @@ def slope_bound(roadmap: Roadmap) -> float | None:
     """
     bound: float | None = roadmap.parameters.get("raised_slope") or roadmap.parameters.get("max_slope")
     return bound
+
+
+def check_slope_bound(parameters: Mapping[str, Any]) -> None:
+    """Checks what a file says of the bound of a roadmap's slopes.
+
+    Raises:
+        ValueError: A figure is no number above 0.
+    """
+    for name in ("max_slope", "raised_slope", "connectivity"):
+        value = parameters.get(name)
+        if value is not None and not (isinstance(value, int | float) and value > 0.0):
+            raise ValueError(f"'{name}' is no number above 0")
 
 
 def left_out_edges(roadmap: Roadmap) -> Tensor:
