@@ -128,7 +128,7 @@ def test_of_the_preset_s_grids_nearly_all_edges_are_left_and_lie_within_the_boun
     assert slope_bound(roadmap) >= roadmap.parameters["max_slope"] == problem.max_slope
 
 
-@pytest.mark.parametrize("connectivity", [0.0, 0.9, 0.97, 1.0])
+@pytest.mark.parametrize("connectivity", [0.5, 0.9, 0.97, 1.0])
 def test_the_bound_is_raised_as_far_as_so_many_edges_take_it_and_no_further(pair, tmp_path, connectivity):
     free, bounded = pair
     asked = replace(bounded, parameters={**bounded.parameters, "connectivity": connectivity})
