@@ -110,8 +110,7 @@ def test_copies_are_relaxed_as_if_each_were_alone(planar_5):
     seeds = torch.tensor([[0.3, 0.5, 0.5, 0.5, 0.5], [2.0, -1.0, 0.4, -0.9, 0.3]], dtype=torch.float64)
     maps = torch.stack([expand(planar_5, task, graph, seed[None]).configurations for seed in seeds])
     assert bool(maps.isfinite().all())
-    # a bound of their own would depend on all of them
-    together = _relaxed(planar_5, task, graph, maps, Tolerances(), 8, 40.0)
+    together = _relaxed(planar_5, task, graph, maps, Tolerances(), 8, 40.0)  # by default the bound depends on all
     for plain, moved in zip(maps, together, strict=True):
         alone = _relaxed(planar_5, task, graph, plain[None], Tolerances(), 8, 40.0)[0]
         costs = [float(_costs(planar_5, task, graph, q[None])) for q in (plain, moved, alone)]

@@ -79,8 +79,8 @@ def build(
         objectives: Weights of "clearance", "manipulability" and "limits", which refinement serves besides smoothness;
             at weight 1, 1 % of an objective's mean is worth 1 % of smoothness.
         max_slope: Edges with D_q / D_p above this [rad/m] are not connected, though continuous: there small moves of
-            the hand are large ones of the arm. inf: no bound. By default that of the preset's grid, if it has
-            one and the method is expansion, which refinement raises at its end as far as the preset says.
+            the hand are large ones of the arm. inf: no bound. By default that of the preset's grid, which refinement
+            may raise at its end, if it has one and the method is expansion; otherwise none.
         reachability: Random starts for each unresolved vertex, to tell which are reachable; 0: not measured.
         seed: Of all random draws. On the CPU the same inputs give the same tensors.
         tolerances: When a configuration counts as being at a point.
