@@ -72,7 +72,7 @@ def test_it_loads_without_the_urdf(box_arm, tmp_path):
 def test_the_file_names_its_tensors_and_origin(saved):
     assert set(load_file(saved)) == {*TENSORS, *TABLES}
     metadata = {name: json.loads(value) for name, value in header(saved).items()}
-    assert metadata["format_version"] == 3
+    assert metadata["format_version"] == 4
     assert metadata["package_version"] == grr_torch.__version__
     assert metadata["robot"]["tool"] == "tool"
     assert len(metadata["robot"]["urdf_sha256"]) == 64
@@ -152,7 +152,7 @@ DAMAGES = {
     "truncated": "truncated",
     "text": "truncated or not a roadmap",
     "empty": "truncated or not a roadmap",
-    "version": "format version 99; this version reads 3",
+    "version": "format version 99; this version reads 4",
     "foreign": "not a roadmap of grr-torch",
     "metadata": "cannot be read",
     "robot": "metadata without .urdf_directory.",

@@ -23,9 +23,11 @@ from grr_torch.spaces.configuration import difference
 _ROUNDS = 18
 # cells with less spread are not looked at [rad]
 _SUSPECT = 0.6
-# in a first and a second attempt, spread that is aimed at [rad], and beyond which a cell is given up [rad]; the second
-# is for maps with more cells left below its limit than between the two limits: these may hold those
-_AIM, _HOPELESS = (0.93, 0.96), (1.4, 1.1)
+# the spread that is aimed at, and beyond which a cell is given up [rad]: in a first attempt; in a second one, for maps
+# with more cells left between the limit and 1.1 rad than above, which may hold those; and in one for maps with only a
+# handful left, some of them just beyond what the first gives up
+_FIRST, _TIGHT, _WIDE = (0.93, 1.4), (0.96, 1.1), (0.93, 1.7)
+_HANDFUL = 16
 # cells of maps that are attempted twice: it takes long
 _MOST_TWICE = 65536
 # how much a pull counts against an edge of typical weight
@@ -63,17 +65,18 @@ def certify(
     looking, *stages = map(checkpoint.stage, names)
     robot, task, points = network.robot, network.task, network.targets.T
 
-    def attempt(number: int) -> tuple[Tensor, Tensor]:
-        kept, looking_again = stages[2 * number : 2 * number + 2]
+    def attempt(aim: float, hopeless: float) -> tuple[Tensor, Tensor]:
+        again = (aim, hopeless) != _FIRST
+        kept, looking_again = stages[2:] if again else stages[:2]
         # the time left is told as if there were no second attempt
-        told = silent if number else progress
-        given = corners[suspects], spread[suspects], q, _AIM[number], _HOPELESS[number]
+        told = silent if again else progress
+        given = corners[suspects], spread[suspects], q, aim, hopeless
         moved = _drawn_together(network, *given, tolerances, told, kept)
         told("certifying", _ROUNDS, _ROUNDS)
         # cells that were not looked at may have suffered, where their corners have moved far enough
         doubtful = ~(spread + _GROWTH * _way(network, corners, q, moved) <= LARGEST_SPREAD)
-        again = spreads(robot, task, points, moved.T, corners[doubtful], tolerances, told, looking_again)
-        return moved, again[again > LARGEST_SPREAD]
+        found = spreads(robot, task, points, moved.T, corners[doubtful], tolerances, told, looking_again)
+        return moved, found[found > LARGEST_SPREAD]
 
     with one_thread(), torch.no_grad():
         spread = spreads(robot, task, points, q.T, corners, tolerances, progress, looking)
@@ -81,15 +84,22 @@ def certify(
         if len(left) == 0:
             return q
         suspects = spread > _SUSPECT
-        moved, found = attempt(0)
+        moved, found = attempt(*_FIRST)
         if len(found) < len(left):
             best, left = moved, found
-        near, farther = found <= _HOPELESS[1], (found > _HOPELESS[1]) & (found <= _HOPELESS[0])
-        if 0 < int(farther.sum()) < int(near.sum()) and len(corners) <= _MOST_TWICE:
-            moved, found = attempt(1)
+        if (second := _second(left)) is not None and len(corners) <= _MOST_TWICE:
+            moved, found = attempt(*second)
             if len(found) < len(left):
                 best = moved
     return best
+
+
+def _second(left: Tensor) -> tuple[float, float] | None:
+    """Aim and limit of a second attempt, by the spread of the cells that the first has left; None if there is none."""
+    within = [int((left <= hopeless).sum()) for _, hopeless in (_TIGHT, _FIRST, _WIDE)]
+    if within[0] < within[1] < 2 * within[0]:
+        return _TIGHT
+    return _WIDE if within[1] < within[2] and len(left) <= _HANDFUL else None
 
 
 def _drawn_together(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
 # what `parameters["refinement"]` keeps of the quality before
-BEFORE = ("resolved_vertices", "connected_edges", "smoothness", "triangles_wound", "triangles_spread")
+BEFORE = ("resolved_vertices", "connected_edges", "smoothness", "triangles", "triangles_wound", "triangles_spread")
 # figures of a map without edges or vertices
 _MAY_BE_NONE = {"smoothness", "smoothest", "mean", "worst"}
 
@@ -28,6 +28,7 @@ def before_refinement(roadmap: Roadmap, progress: Progress, kept: Stage) -> dict
         int(roadmap.resolved.sum()),
         int(roadmap.connected.sum()),
         float(slopes.mean()) if len(slopes) else None,
+        len(cells.corners),
         int(cells.wound.sum()),
         int(cells.spread_out.sum()),
     )
@@ -69,12 +70,17 @@ def summary(roadmap: Roadmap, quality: Quality) -> str:
         ("vertices", "resolved_vertices"),
         ("edges", "connected_edges"),
         ("windings", "triangles_wound"),
-        ("spread triangles", "triangles_spread"),
     )
     changes = [f"{name} {before[key]:,} → {getattr(quality, key):,}" for name, key in named]
+    changes.append(f"certified triangles {_certified(before)} → {_certified(quality.to_dict())}")
     if before["smoothness"] is not None and quality.smoothness is not None:
         changes.insert(0, f"smoothness {before['smoothness']:.3f} → {quality.smoothness:.3f}")
     return ", ".join(changes) + f", in {before['seconds']:.2f} s"
+
+
+def _certified(figures: Mapping[str, Any]) -> str:
+    certified = figures["triangles"] - figures["triangles_wound"] - figures["triangles_spread"]
+    return f"{certified:,} of {figures['triangles']:,}"
 
 
 def traded(roadmap: Roadmap, quality: Quality) -> dict[str, str]:

@@ -29,7 +29,7 @@ from grr_torch.tensor_file import read_tensor_file, tensor_hash, tensors_hash, w
 from grr_torch.version import __version__
 
 FORMAT = "grr-torch roadmap"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 _DTYPES = {
     "points": torch.float64,
