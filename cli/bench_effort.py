@@ -19,6 +19,9 @@ def effort(
     task: Annotated[
         list[str] | None, typer.Option(help="position or fixed-rotation; repeatable; both by default.")
     ] = None,
+    max_slope: Annotated[
+        float | None, typer.Option(help="Leave out steeper edges, in rad/m; by default those that `build` does.")
+    ] = None,
     json_file: FiguresFile = None,
 ) -> None:
     """Print the best refined roadmaps of many draws of found seeds, as a Markdown table.
@@ -33,8 +36,10 @@ def effort(
 
     check_outputs({"--json": json_file})
     with progress_bar() as progress:
-        results = measure_effort(draws, robots=robot, tasks=task, progress=progress)
-    write_figures(json_file, {"draws": draws, "roadmaps": [result.to_dict() for result in results]})
+        results = measure_effort(draws, robots=robot, tasks=task, max_slope=max_slope, progress=progress)
+    write_figures(
+        json_file, {"draws": draws, "max_slope": max_slope, "roadmaps": [result.to_dict() for result in results]}
+    )
     show_machine()
     head = ["problem", "seeds", "resolved", "connected", "smoothness", "certified triangles", "time [s]"]
     typer.echo(markdown_table(head, [_row(result) for result in results]))

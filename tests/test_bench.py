@@ -143,7 +143,11 @@ def test_only_roadmaps_that_no_other_beats_are_shown():
     assert not any(one.beats(other) for one in best for other in best)
     smoothness = [one.quality.smoothness for one in best]
     assert smoothness == sorted(smoothness)
+    gentle = measure_effort(1, robots=["planar_5"], tasks=["fixed-rotation"], max_slope=60.0)
+    assert all(one.quality.smoothness_max <= 60.0 < best[0].quality.smoothness_max for one in gentle)
     with pytest.raises(ParameterError, match="draws"):
         measure_effort(0)
+    with pytest.raises(ParameterError, match="max_slope"):
+        measure_effort(1, max_slope=0.0)
     with pytest.raises(UnknownNameError, match="fixed-rotation"):
         measure_effort(1, tasks=["pose"])

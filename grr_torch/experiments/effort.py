@@ -56,7 +56,12 @@ class Best:
 
 
 def measure_effort(
-    draws: int, *, robots: Sequence[str] | None = None, tasks: Sequence[str] | None = None, progress: Progress = silent
+    draws: int,
+    *,
+    robots: Sequence[str] | None = None,
+    tasks: Sequence[str] | None = None,
+    max_slope: float | None = None,
+    progress: Progress = silent,
 ) -> list[Best]:
     """Builds each problem from the preset's seeds and from those that `draws` generator seeds find.
 
@@ -64,13 +69,14 @@ def measure_effort(
         draws: How many.
         robots: Of planar_5 and kinova; both by default.
         tasks: Of position and fixed-rotation; both by default.
+        max_slope: As of `build`.
         progress: Told which roadmap is built.
 
     Returns:
         For each problem, the roadmaps that no other beats, the smoothest first.
 
     Raises:
-        ParameterError: `draws` is below 1.
+        ParameterError: `draws` is below 1, or `max_slope` is not above 0.
         UnknownNameError: No such robot or task.
     """
     if draws < 1:
@@ -83,7 +89,8 @@ def measure_effort(
         for draw in range(draws + 1):
             progress(f"{name} {task}", index * (draws + 1) + draw, len(problems) * (draws + 1))
             seed = draw - 1 if draw else None
-            roadmap = build(robot, task, seeds=None if seed is None else "auto", seed=seed or 0)
+            seeds = None if seed is None else "auto"
+            roadmap = build(robot, task, seeds=seeds, seed=seed or 0, max_slope=max_slope)
             maps.append(Best(name, task, seed, roadmap.build_seconds, roadmap.quality()))
         best = {one.merits: one for one in reversed(maps) if not any(other.beats(one) for other in maps)}
         results += sorted(best.values(), key=lambda one: one.merits[2], reverse=True)
