@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,6 @@ from grr_torch.applications.routes import Routes
 from grr_torch.applications.steps import Steps
 from grr_torch.applications.straight import Straight
 from grr_torch.applications.teleoperate import STATUSES, Teleoperator
-from grr_torch.errors import ParameterError
 from grr_torch.experiments.paths import draw_paths
 
 
@@ -174,82 +171,6 @@ def test_joints_are_not_wrapped(planar_roadmap):
     assert float((q[-1, 0] - q[0, 0]).abs()) > 6.0
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_target_that_is_not_finite_is_refused_and_held(roadmap, bad):
-    vertices = some_vertices(roadmap, 2, 1)
-    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertices])
-    target = roadmap.points[vertices].clone()
-    target[0, 1] = bad
-    before = teleoperator.configuration
-    command = teleoperator.step(target)
-    assert command.status.tolist() == ["holding", "tracking"]
-    assert torch.equal(command.configuration[0], before[0])
-    assert bool(command.configuration.isfinite().all())
-
-
-def test_a_far_jump_is_refused_until_reset(roadmap):
-    first, second = some_vertices(roadmap, 2, 2)
-    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[first], max_jump=0.05)
-    assert teleoperator.step(roadmap.points[first]).status == "tracking"
-    held = teleoperator.step(roadmap.points[second])
-    assert held.status == "holding"
-    assert torch.equal(teleoperator.step(roadmap.points[second]).configuration, held.configuration)
-    teleoperator.reset()
-    assert teleoperator.step(roadmap.points[second]).status != "holding"
-
-
-def test_old_input_is_refused(roadmap):
-    vertex = some_vertices(roadmap, 1, 4)[0]
-    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex], timeout=0.1)
-    point = roadmap.points[vertex]
-    for step in range(10):
-        assert teleoperator.step(point, time=1000.0 + 0.02 * step).status == "tracking"
-    stale = [str(teleoperator.step(point, time=1000.18).status) for _ in range(10)]
-    assert stale[0] == "tracking"
-    assert stale[-1] == "holding"
-    assert teleoperator.step(point, time=float("nan")).status == "holding"
-    teleoperator.reset()
-    assert teleoperator.step(point, time=5.0).status == "tracking"
-
-
-def test_after_the_clutch_it_starts_where_the_arm_is(roadmap):
-    first, second = some_vertices(roadmap, 2, 6)
-    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[first])
-    teleoperator.step(roadmap.points[first])
-    teleoperator.reset(roadmap.configurations[second])
-    command = teleoperator.step(roadmap.points[second])
-    assert torch.allclose(command.configuration, roadmap.configurations[second], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "what"),
-    [
-        ({"rate": 0.0}, "rate"),
-        ({"rate": float("nan")}, "rate"),
-        ({"max_step": -0.1}, "max_step"),
-        ({"max_step": torch.ones(3)}, "max_step"),
-        ({"acceleration_limits": 0.0}, "acceleration_limits"),
-        ({"max_jump": 0.0}, "max_jump"),
-        ({"foresight": -0.1}, "foresight"),
-        ({"foresight": math.nan}, "foresight"),
-        ({"foresight": math.inf}, "foresight"),
-        ({"timeout": -1.0}, "timeout"),
-        ({"start": torch.zeros(6)}, "shape"),
-        ({"start": torch.full((7,), float("nan"))}, "finite"),
-    ],
-)
-def test_bad_parameters_are_refused(roadmap, arguments, what):
-    with pytest.raises(ParameterError, match=what):
-        Teleoperator(roadmap, **arguments)
-
-
-@pytest.mark.parametrize("target", [torch.zeros(2), torch.zeros(5, 3), [0.1, 0.2, 0.3], torch.tensor(0.5)])
-def test_targets_of_another_shape_are_refused(roadmap, target):
-    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[some_vertices(roadmap, 1)[0]])
-    with pytest.raises(ParameterError, match="target"):
-        teleoperator.step(target)
-
-
 @pytest.mark.parametrize("count", [1, 50, 320])
 def test_any_number_of_arms_in_single_precision_track(count):
     robot = grr_torch.load_robot("kinova", dtype=torch.float32)
@@ -295,12 +216,3 @@ def test_routes_leave_out_the_edges_that_are_avoided(roadmap):
         assert (longer >= cost - 1e-12).all()
         cost = longer
     assert routes.towards(goal)[0][start] < cost[start], "others still take them"
-
-
-def test_no_arms_are_no_error_and_starts_may_have_gradients(roadmap):
-    nobody = Teleoperator(roadmap, start=torch.zeros(0, 7, dtype=torch.float64))
-    command = nobody.step(torch.zeros(0, 3, dtype=torch.float64))
-    assert command.configuration.shape == (0, 7)
-    assert command.status.shape == (0,)
-    start = roadmap.configurations[some_vertices(roadmap, 1)].requires_grad_()
-    assert not Teleoperator(roadmap, start=start).step(torch.zeros(1, 3)).configuration.requires_grad

@@ -289,17 +289,6 @@ class Roadmap:
         Raises:
             ImportError: networkx is not installed.
         """
-        import networkx
+        from grr_torch.resolution.networkx_graph import to_networkx
 
-        from grr_torch.spaces.configuration import distance
-
-        graph: networkx.Graph[int] = networkx.Graph()
-        points, q = self.points.numpy(), self.configurations.numpy()
-        for vertex in self.resolved.nonzero()[:, 0].tolist():
-            graph.add_node(vertex, point=points[vertex], configuration=q[vertex])
-        first, second = self.edges[self.connected].T
-        d_p = self.task.distance(self.points[first], self.points[second]).tolist()
-        d_q = distance(self.configurations[first], self.configurations[second], self.robot.continuous.cpu()).tolist()
-        for a, b, p, c in zip(first.tolist(), second.tolist(), d_p, d_q, strict=True):
-            graph.add_edge(a, b, point_distance=p, configuration_distance=c)
-        return graph
+        return to_networkx(self)
