@@ -8,7 +8,7 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Colours = npt.NDArray[np.uint8]
 
-CONNECTED = (58, 66, 78, 255)
+CONNECTED = (41, 47, 58, 255)
 BROKEN = (235, 70, 50, 255)
 WOUND = (225, 60, 190, 150)
 SPREAD = (240, 150, 40, 110)

@@ -162,7 +162,7 @@ def _log_tour(recording: Any, roadmap: Roadmap, robot: RecordedRobot) -> None:
     recording.log(
         "tour/path",
         rr.CoordinateFrame(roadmap.robot.base),
-        rr.LineStrips3D([trace], colors=colours.TOUR, radii=_line(1.0)),
+        rr.LineStrips3D([trace], colors=colours.TOUR, radii=_line(0.7)),
         static=True,
     )
     recording.log("tour/tool", rr.CoordinateFrame(roadmap.robot.base), static=True)
