@@ -41,18 +41,18 @@ def pair(request) -> tuple[grr_torch.Roadmap, grr_torch.Roadmap]:
 
 
 def test_only_edges_above_the_bound_are_left_out(pair):
-    free, bounded = pair
+    free, limited = pair
     bound = BOUNDS[free.robot.name]
-    assert torch.equal(free.configurations[free.resolved], bounded.configurations[free.resolved])
+    assert torch.equal(free.configurations[free.resolved], limited.configurations[free.resolved])
     slopes = edge_slopes(free)
     above = torch.zeros_like(free.connected)
     above[free.connected.nonzero()[:, 0][slopes > bound]] = True
     assert bool(above.any())
-    assert torch.equal(bounded.connected, free.connected & ~above)
-    assert bounded.quality().smoothness_max <= bound < free.quality().smoothness_max
-    left_out = left_out_edges(bounded)
+    assert torch.equal(limited.connected, free.connected & ~above)
+    assert limited.quality().smoothness_max <= bound < free.quality().smoothness_max
+    left_out = left_out_edges(limited)
     assert set(above.nonzero()[:, 0].tolist()) <= set(left_out.tolist())
-    assert bool((edge_slopes(bounded, left_out).diff() <= 0.0).all())
+    assert bool((edge_slopes(limited, left_out).diff() <= 0.0).all())
     assert len(left_out_edges(free)) == 0
 
 
@@ -67,30 +67,30 @@ def test_slopes_are_those_of_their_edges(pair):
 
 
 def test_a_file_with_a_bound_is_verified_by_it(pair, tmp_path):
-    _, bounded = pair
-    bounded.save(tmp_path / "m.grr")
+    _, limited = pair
+    limited.save(tmp_path / "m.grr")
     assert all(check.passed for check in verify_file(tmp_path / "m.grr"))
-    connected = bounded.connected.clone()
-    connected[left_out_edges(bounded)[0]] = True
-    replace(bounded, connected=connected).save(tmp_path / "spoilt.grr")
+    connected = limited.connected.clone()
+    connected[left_out_edges(limited)[0]] = True
+    replace(limited, connected=connected).save(tmp_path / "spoilt.grr")
     failed = {check.name for check in verify_file(tmp_path / "spoilt.grr") if not check.passed}
     assert failed == {"edges"}
 
 
 @pytest.mark.parametrize("objectives", [None, {"manipulability": 1.0}])
 def test_refining_keeps_the_bound_and_loses_no_edge_to_it(pair, objectives):
-    free, bounded = pair
+    free, limited = pair
     bound = BOUNDS[free.robot.name]
-    refined = refine(bounded, objectives=objectives)
+    refined = refine(limited, objectives=objectives)
     assert refined.quality().smoothness_max <= refined.parameters["max_slope"] == bound
-    assert bool(refined.connected[bounded.connected].all())
+    assert bool(refined.connected[limited.connected].all())
     assert bool((edge_slopes(refined, left_out_edges(refined)) > bound).all())
 
 
 def test_a_build_refines_what_the_bound_leaves(pair):
-    _, bounded = pair
-    robot, bound = bounded.robot, BOUNDS[bounded.robot.name]
-    built, refined = grr_torch.build(robot, "position", points=400, max_slope=bound), refine(bounded)
+    _, limited = pair
+    robot, bound = limited.robot, BOUNDS[limited.robot.name]
+    built, refined = grr_torch.build(robot, "position", points=400, max_slope=bound), refine(limited)
     assert torch.equal(built.configurations[built.resolved], refined.configurations[refined.resolved])
     assert torch.equal(built.connected, refined.connected)
 
@@ -130,16 +130,16 @@ def test_of_the_preset_s_grids_nearly_all_edges_are_left_and_lie_within_the_boun
 
 @pytest.mark.parametrize("connectivity", [0.5, 0.9, 0.97, 1.0])
 def test_the_bound_is_raised_as_far_as_so_many_edges_take_it_and_no_further(pair, tmp_path, connectivity):
-    free, bounded = pair
-    asked = replace(bounded, parameters={**bounded.parameters, "connectivity": connectivity})
+    free, limited = pair
+    asked = replace(limited, parameters={**limited.parameters, "connectivity": connectivity})
     raised = with_raised_bound(asked)
-    between = int(bounded.resolved[bounded.edges].all(1).sum())
+    between = int(limited.resolved[limited.edges].all(1).sum())
     wanted = min(int(free.connected.sum()), math.ceil(connectivity * between))
     bound, slopes = slope_bound(raised), edge_slopes(raised)
     assert len(slopes) >= wanted
-    assert (raised is asked) == (wanted <= int(bounded.connected.sum()))
+    assert (raised is asked) == (wanted <= int(limited.connected.sum()))
     assert raised is asked or int((slopes < bound - 1e-3).sum()) < wanted
-    assert bool(raised.connected[bounded.connected].all())
+    assert bool(raised.connected[limited.connected].all())
     assert torch.equal(raised.connected, without_steep_edges(replace(free, parameters=raised.parameters)).connected)
     assert bool((edge_slopes(raised, left_out_edges(raised)) > bound).all())
     raised.save(tmp_path / "m.grr")
@@ -147,10 +147,10 @@ def test_the_bound_is_raised_as_far_as_so_many_edges_take_it_and_no_further(pair
 
 
 def test_a_map_without_a_bound_or_a_share_has_none_to_raise(pair):
-    free, bounded = pair
+    free, limited = pair
     asked = replace(free, parameters={**free.parameters, "connectivity": 1.0})
     assert with_raised_bound(asked) is asked
-    assert with_raised_bound(bounded) is bounded
+    assert with_raised_bound(limited) is limited
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -204,11 +204,11 @@ def test_the_command_takes_the_bound_of_the_preset(kinova, run_cli, given, has_o
 
 
 def test_a_last_repair_moves_nothing_for_edges_that_are_left_out(pair):
-    _, bounded = pair
-    repaired = without_steep_edges(repair(bounded, Tolerances(), 0, at_last=True))
-    assert bool(repaired.connected[bounded.connected].all())
-    moved = (repaired.configurations != bounded.configurations)[bounded.resolved].any()
-    assert int(repaired.connected.sum()) > int(bounded.connected.sum()) or not bool(moved)
+    _, limited = pair
+    repaired = without_steep_edges(repair(limited, Tolerances(), 0, at_last=True))
+    assert bool(repaired.connected[limited.connected].all())
+    moved = (repaired.configurations != limited.configurations)[limited.resolved].any()
+    assert int(repaired.connected.sum()) > int(limited.connected.sum()) or not bool(moved)
 
 
 def test_the_commands_take_a_bound_and_list_what_is_left_out(run_cli):

@@ -53,10 +53,10 @@ class FewSpheres:
         if np.count_nonzero(near) == 0:
             return np.zeros(near.shape[1], dtype=bool)
         hit = near.any(0)
-        some = hit.nonzero()[0]
-        hit[some] = False
-        placed = _place(self._centres, poses[..., some])
-        pairs, columns = near[:, some].nonzero()
+        few = hit.nonzero()[0]
+        hit[few] = False
+        placed = _place(self._centres, poses[..., few])
+        pairs, columns = near[:, few].nonzero()
         limits = np.square(self._reach + margin)
         at_once = max(1, _DISTANCES_AT_ONCE // self._reach[0].size)
         for start in range(0, len(pairs), at_once):
@@ -69,7 +69,7 @@ class FewSpheres:
             squared += np.einsum("msk,msk->ms", a, a)[:, :, None]
             squared += np.einsum("msk,msk->ms", b, b)[:, None]
             touching = ~(squared >= limits[which]).reshape(len(which), -1).all(1)
-            hit[some[column[touching]]] = True
+            hit[few[column[touching]]] = True
         return hit
 
 
