@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from random_robots import random_urdf
 from scipy.spatial import cKDTree
 
 import grr_torch
@@ -58,6 +59,43 @@ def test_distance_is_that_of_all_pairs(kinova, generator):
     torch.testing.assert_close(kinova.self_collision_distance(q), expected, atol=1e-12, rtol=0)
     assert torch.equal(kinova.in_self_collision(q), expected < kinova.margin)
     assert 0.005 < kinova.in_self_collision(q).double().mean() < 0.5
+
+
+def random_arm(folder, seed):
+    """An arm with joints of every kind, branches and a mimic joint, and a few spheres on each link."""
+    rng = np.random.default_rng(seed)
+    path = folder / "arm.urdf"
+    path.write_text(random_urdf(rng, 6, branches=True, mimic=True), encoding="utf-8")
+    links = [f"link_{k}" for k in range(8)] + ["finger_2", "finger_4", "finger_6"]
+    spheres = {
+        link: tuple(Sphere(tuple(rng.uniform(-0.1, 0.1, 3)), rng.uniform(0.01, 0.04)) for _ in range(3))
+        for link in links
+    }
+    return grr_torch.load_robot(path, tool="tool", spheres=SphereModel(spheres, frozenset()), margin=0.001)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_within_motions_that_are_ruled_out_nothing_touches(tmp_path, kinova, seed):
+    rng = np.random.default_rng(seed)
+    for arm in (random_arm(tmp_path, seed), kinova):
+        count = arm.few.kinematics.frames(np.zeros((arm.n, 1))).shape[3] * 60
+        q = arm.sample(count, torch.Generator().manual_seed(seed)).numpy().T
+        motions = 0.2 * rng.random(count) * rng.normal(size=q.shape)
+        ruled_out = ~arm.few.may_collide_near(np.ascontiguousarray(q), motions)
+        for share in np.linspace(-1.0, 1.0, 9):
+            assert not (arm.few.in_self_collision(np.ascontiguousarray(q + share * motions)) & ruled_out).any()
+        assert arm is not kinova or 0.1 < ruled_out.mean() < 0.9
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_links_move_against_each_other_no_farther_than_their_levers_allow(tmp_path, seed):
+    arm = random_arm(tmp_path, seed)
+    kernel, generator = arm.sphere_kernel, torch.Generator().manual_seed(seed)
+    first, second = arm.sample(500, generator), arm.sample(500, generator)
+    apart = [kernel._squared(arm.tree.frames(q.T.contiguous()), kernel.bounds).sqrt() for q in (first, second)]
+    allowed = kernel.levers @ (second - first).abs().T
+    assert bool(((apart[1] - apart[0]).abs() <= allowed + 1e-12).all())
+    assert bool(kernel.levers.isfinite().any())
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.05, 0.2])
@@ -218,7 +256,7 @@ def test_a_missing_sphere_file_is_a_clear_error(tmp_path):
 
 def test_a_few_configurations_are_checked_as_many_are(kinova, generator):
     q = torch.cat([kinova.sample(2000, generator), torch.full((1, 7), torch.nan, dtype=torch.float64)])
-    assert 90 < kinova._sphere_kernel.most_of_few < len(q)
+    assert 90 < kinova.sphere_kernel.most_of_few < len(q)
     many = kinova.in_self_collision(q)
     assert 60 < int(many.sum()) < 1800
     assert torch.equal(many, torch.cat([kinova.in_self_collision(part) for part in q.split(90)]))

@@ -162,6 +162,15 @@ def test_arms_that_track_do_as_they_would_if_they_looked_at_everything(roadmap, 
     assert torch.allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
+def test_ways_that_are_ruled_out_change_nothing(roadmap, monkeypatch):
+    start, targets = roadmap.configurations[some_vertices(roadmap, 24, 2)], _hostile(roadmap, 24, 60, 3)
+    q = []
+    for many in (1, 10**9):
+        monkeypatch.setattr("grr_torch.applications.motions._MANY", many)
+        q.append(follow_targets(Teleoperator(roadmap, start=start), targets)[0])
+    assert torch.equal(*q)
+
+
 def test_joints_are_not_wrapped(planar_roadmap):
     """Round the base, joint values go on beyond π."""
     angles = torch.linspace(0.0, 4.0 * torch.pi, 400, dtype=torch.float64)

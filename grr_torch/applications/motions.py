@@ -18,6 +18,8 @@ from grr_torch.spaces.task import TaskSpace
 
 # configurations between two steps at which self-collision is checked, the second step's own included
 SUBSTEPS = 8
+# of fewer arms it takes less time to look at all their ways than to find out which ones to look at
+_MANY = 8
 # points no farther apart than this [m] are the same goal
 _SAME_GOAL = 0.03
 # of the longest step, so that what the projection adds seldom has to be cut off
@@ -94,17 +96,24 @@ class Motions:
         Returns:
             (B, K) configurations in self-collision, and (B,) ways that touch any.
         """
-        between = q[on_way, None] + self._substeps * (ends - q)[on_way, None]
+        hit, struck = np.zeros(asked.shape, dtype=bool), ~on_way
+        looked = self._doubtful(q, ends, on_way)
+        between = q[looked, None] + self._substeps * (ends - q)[looked, None]
         every = np.concatenate([alone[asked], between.reshape(-1, q.shape[1])])
-        collides = self.robot.few_in_self_collision(np.ascontiguousarray(every.T))
-        hit, struck = np.zeros(asked.shape, dtype=bool), np.ones(len(q), dtype=bool)
-        if not some(collides):
-            struck[on_way] = False
-            return hit, struck
-        count = len(every) - between.shape[0] * SUBSTEPS
-        hit[asked] = collides[:count]
-        struck[on_way] = collides[count:].reshape(-1, SUBSTEPS).any(1)
+        collides = self.robot.few.in_self_collision(np.ascontiguousarray(every.T))
+        if some(collides):
+            count = len(every) - between.shape[0] * SUBSTEPS
+            hit[asked] = collides[:count]
+            struck[looked] = collides[count:].reshape(-1, SUBSTEPS).any(1)
         return hit, struck
+
+    def _doubtful(self, q: Array, ends: Array, on_way: Mask) -> Array:
+        """Of arms on the way from `q` (B, n) to `ends` (B, n), those (D,) whose ways have to be looked at."""
+        ways = on_way.nonzero()[0]
+        if len(ways) < _MANY:
+            return ways
+        half = 0.5 * (ends - q)[ways].T
+        return ways[self.robot.few.may_collide_near(q[ways].T + half, half)]
 
     def distance(self, start: Array, end: Array) -> Array:
         """D_q (…,) of arrays."""

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 @np.errstate(over="ignore", invalid="ignore")
 def project_few(robot: Robot, task: TaskSpace, tolerances: Tolerances, targets: Array, q: Array) -> tuple[Array, Mask]:
     """Configurations (n, N), NaN where not converged, and converged (N,), for points (width, N) and guesses (n, N)."""
-    few, rows = robot.tree.few, task.dimension
-    limits = robot.limits_of_few
+    few, rows, limits = robot.few.kinematics, task.dimension, robot.few.limits
     solved, valid = np.full(q.shape, np.nan, q.dtype), np.zeros(q.shape[1], dtype=bool)
     now = q if limits is None else _clamped(q, limits)
     rank = np.arange(q.shape[1])
@@ -61,7 +60,7 @@ def project_few(robot: Robot, task: TaskSpace, tolerances: Tolerances, targets: 
         jacobian[rows:] *= ROTATION_LENGTH
         error[rows:] *= ROTATION_LENGTH
         now = _step(limits, now, jacobian, error, 0.5 * DAMPING * size + LEAST_DAMPING)
-    return solved - robot.turns_of_few * np.rint(solved * (0.5 / math.pi)), valid
+    return solved - robot.few.turns * np.rint(solved * (0.5 / math.pi)), valid
 
 
 def _step(limits: tuple[Array, Array] | None, q: Array, jacobian: Array, error: Array, damping: Array) -> Array:

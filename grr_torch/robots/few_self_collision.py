@@ -39,6 +39,7 @@ class FewSpheres:
             self._centres[link, 1:, :3] = own[_padded(len(own), size)]
         self._frames = kernel.frames.numpy()
         self._bound_reach = kernel.bound_reach.numpy()
+        self._levers = kernel.levers.numpy()
         reach = (pair.reach[..., 0].numpy() for pair in kernel.spheres)
         self._reach = np.stack([part[np.ix_(*(_padded(count, size) for count in part.shape))] for part in reach])
 
@@ -47,12 +48,10 @@ class FewSpheres:
     def collides(self, frames: Array, margin: float) -> NDArray[np.bool_]:
         """`SphereKernel.collides`: (N,) bool for frames (F, 4, 3, N)."""
         poses = frames[self._frames]
-        bounds = _place(self._bounds, poses)[:, 0]
-        apart = bounds[self._first] - bounds[self._second]
-        near = ~(np.einsum("pkn,pkn->pn", apart, apart) >= np.square(self._bound_reach + margin))
+        near = self._near(poses, self._bound_reach + margin)
         if np.count_nonzero(near) == 0:
             return np.zeros(near.shape[1], dtype=bool)
-        hit = near.any(0)
+        hit: NDArray[np.bool_] = np.any(near, axis=0)
         few = hit.nonzero()[0]
         hit[few] = False
         placed = _place(self._centres, poses[..., few])
@@ -71,6 +70,19 @@ class FewSpheres:
             touching = ~(squared >= limits[which]).reshape(len(which), -1).all(1)
             hit[few[column[touching]]] = True
         return hit
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def may_collide_near(self, frames: Array, margin: float, motions: Array) -> NDArray[np.bool_]:
+        """`Few.may_collide_near` for frames (F, 4, 3, N) and motions (n, N)."""
+        reach = self._bound_reach + margin + self._levers @ np.abs(motions)
+        return np.asarray(np.any(self._near(frames[self._frames], reach), axis=0))
+
+    def _near(self, poses: Array, reach: Array) -> NDArray[np.bool_]:
+        """Pairs of links (P, N) whose bounding spheres' centres are nearer to each other than (P, 1 or N)."""
+        bounds = _place(self._bounds, poses)[:, 0]
+        apart = bounds[self._first] - bounds[self._second]
+        near: NDArray[np.bool_] = ~(np.einsum("pkn,pkn->pn", apart, apart) >= np.square(reach))
+        return near
 
 
 def _place(centres: Array, poses: Array) -> Array:

@@ -8,7 +8,7 @@ the joints come the tool's and the base's.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -60,6 +60,12 @@ class KinematicTree:
     tool: str
     path: tuple[int, ...]
     n: int
+
+    def above(self, frame: int) -> Iterator[int]:
+        """The frame, and those that it is mounted on, up to the base, which is left out."""
+        while frame >= 0:
+            yield frame
+            frame = self.joints[frame].parent
 
     def frames(self, q: Tensor, workspace: Tensor | None = None) -> Tensor:
         """Poses (F, 4, 3, N) of all frames for configurations q (n, N); the last two are the tool and the base.

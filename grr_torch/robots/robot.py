@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import FEW, Array, Mask, are_few, in_pieces, piece
+from grr_torch.pieces import are_few, in_pieces, piece
 from grr_torch.robots.chain import serial_chain
+from grr_torch.robots.few import Few
 from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.presets import Preset
 from grr_torch.robots.self_collision import SphereKernel
@@ -88,14 +89,9 @@ class Robot:
         return not bool(self.lower.isinf().all() & self.upper.isinf().all())
 
     @cached_property
-    def limits_of_few(self) -> tuple[Array, Array] | None:
-        """Arrays (n, 1) of the joint limits, for few configurations on the CPU; None where no joint has any."""
-        return (self.lower.numpy()[:, None], self.upper.numpy()[:, None]) if self.has_limits else None
-
-    @cached_property
-    def turns_of_few(self) -> Array:
-        """(n, 1) a whole turn of continuous joints, 0 of others."""
-        return 2.0 * math.pi * self.continuous.numpy()[:, None].astype(self.lower.numpy().dtype)
+    def few(self) -> Few:
+        """For a few configurations on the CPU."""
+        return Few(self)
 
     @cached_property
     def chain(self) -> SerialChain:
@@ -187,7 +183,7 @@ class Robot:
         Raises:
             ParameterError: The last axis is not n.
         """
-        columns, kernel = self.columns(q), self._sphere_kernel
+        columns, kernel = self.columns(q), self.sphere_kernel
         if kernel is None:
             return columns.new_full(q.shape[:-1], math.inf)
         (distances,) = self._of_frames(lambda frames: (kernel.distance(frames),), columns)
@@ -215,7 +211,7 @@ class Robot:
         Raises:
             ParameterError: The last axis is not n.
         """
-        columns, kernel = self.columns(q), self._sphere_kernel
+        columns, kernel = self.columns(q), self.sphere_kernel
         if kernel is None:
             return {}
         (touching,) = self._of_frames(lambda frames: (kernel.touching(frames, self.margin),), columns)
@@ -268,17 +264,10 @@ class Robot:
 
     def columns_in_self_collision(self, columns: Tensor) -> Tensor:
         """`in_self_collision` for columns (n, N): (N,) bool."""
-        kernel = self._sphere_kernel
+        kernel = self.sphere_kernel
         if kernel is None:
             return torch.zeros(columns.shape[1], dtype=torch.bool, device=columns.device)
         return self._of_frames(lambda frames: (kernel.collides(frames, self.margin),), columns)[0]
-
-    def few_in_self_collision(self, columns: Array) -> Mask:
-        """`columns_in_self_collision` for arrays; on the CPU, no tensors are made of a few."""
-        kernel = self._sphere_kernel
-        if kernel is None or columns.shape[1] > min(FEW, kernel.most_of_few):
-            return self.columns_in_self_collision(torch.from_numpy(columns)).numpy()
-        return kernel.few.collides(self.tree.few.frames(columns), self.margin)
 
     def _tool_pose(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """`KinematicTree.tool_pose` in memory of its own, so that what is kept does not keep all frames."""
@@ -293,7 +282,8 @@ class Robot:
         return in_pieces(lambda part: function(self.tree.frames(part, workspace)), columns)
 
     @cached_property
-    def _sphere_kernel(self) -> SphereKernel | None:
+    def sphere_kernel(self) -> SphereKernel | None:
+        """The self-collision model, compiled; None if nothing is checked."""
         return None if self.spheres is None else SphereKernel.compile(self.spheres, self.tree, self.lower)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -62,6 +63,8 @@ class SphereKernel:
         bound_reach: (P, 1) sums of the bounding radii of each pair [m].
         core_reach: (P, 1) sums of the core spheres' radii [m].
         spheres: For each pair, its spheres.
+        levers: (P, n) how far the bounding spheres of each pair move against each other, at most, when an entry of the
+            configuration moves by so much [m/rad or 1].
     """
 
     bounds: Tensor
@@ -72,6 +75,7 @@ class SphereKernel:
     bound_reach: Tensor
     core_reach: Tensor
     spheres: tuple[_Pair, ...]
+    levers: Tensor
 
     @staticmethod
     def compile(model: SphereModel, tree: KinematicTree, like: Tensor) -> SphereKernel | None:
@@ -100,6 +104,7 @@ class SphereKernel:
             bound_reach=bound_radii[index].sum(0)[:, None],
             core_reach=core_radii[index].sum(0)[:, None],
             spheres=tuple(_pair(centres, radii, *pair) for pair in pairs),
+            levers=torch.stack([_levers(tree, centres, *pair) for pair in pairs]).to(like),
         )
 
     def distance(self, frames: Tensor) -> Tensor:
@@ -193,6 +198,21 @@ def _pair(centres: dict[str, Tensor], radii: dict[str, Tensor], first: str, seco
     rows = torch.cat([-2.0 * a, a.square().sum(1, keepdim=True), torch.ones_like(a[:, :1])], dim=1)
     reach = radii[first][1:, None] + radii[second][1:]
     return _Pair(rows, centres[second][1:].contiguous(), reach[..., None])
+
+
+def _levers(tree: KinematicTree, centres: dict[str, Tensor], first: str, second: str) -> Tensor:
+    """(n,) `SphereKernel.levers` of a pair: by the lengths of the chains that move one of the two only."""
+    levers = torch.zeros(tree.n, dtype=torch.float64)
+    above = [set(tree.above(tree.links[link][0])) for link in (first, second)]
+    for link, others in ((first, above[1]), (second, above[0])):
+        length = float(centres[link][0, :3].norm())
+        for index in tree.above(tree.links[link][0]):
+            joint = tree.joints[index]
+            if index not in others:
+                levers[joint.dof] += abs(joint.multiplier) * (length if joint.revolute else 1.0)
+            # what slides has no length that is known
+            length = length + float(tree.mounts[index][3, :3].norm()) if joint.revolute else math.inf
+    return levers
 
 
 def _with_bound(spheres: Sequence[Sphere]) -> tuple[Tensor, Tensor]:
