@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from teleoperated import follow_targets, some_vertices
@@ -210,6 +212,22 @@ def test_a_target_that_becomes_solvable_is_noticed_on_a_detour_too(roadmap):
     for _ in range(6):
         teleoperator.step(goals)
     assert not arms.holds(changed.nonzero()[:, 0].numpy()).any()
+
+
+def test_arms_do_not_go_to_and_fro_beside_a_hole(roadmap):
+    """While targets go slowly past the base, joints seldom turn round from one step to the next, or tools set off."""
+    generator = torch.Generator().manual_seed(0)
+    angle, beside, height = torch.rand(3, 24, dtype=torch.float64, generator=generator)
+    angle, beside, height = 2.0 * math.pi * angle, 0.3 * beside - 0.15, 0.6 * height - 0.1
+    along = torch.linspace(-0.2, 0.2, 1000, dtype=torch.float64)[:, None]
+    across = (along * angle.cos() - beside * angle.sin(), along * angle.sin() + beside * angle.cos())
+    q, status = follow_targets(Teleoperator(roadmap), torch.stack([*across, height.expand(1000, -1)], dim=2))
+    speed = q.diff(dim=0) / (roadmap.robot.velocity_limits / 50.0)
+    turned = (speed[1:] * speed[:-1] < 0.0) & (speed[1:].abs() > 0.2) & (speed[:-1].abs() > 0.2)
+    assert (status == "unreachable").mean() > 0.3
+    assert float(turned.any(2).double().sum(0).mean()) < 2.0
+    away = torch.from_numpy(status == "detouring")
+    assert float((away[1:] & ~away[:-1]).double().sum(0).mean()) < 1.0
 
 
 def test_no_arm_stays_on_a_detour_that_leads_nowhere(roadmap):

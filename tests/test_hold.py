@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import grr_torch
-from grr_torch.applications.hold import nearest_feasible
+from grr_torch.applications.hold import LEVELS, nearest_feasible
 from grr_torch.applications.lines import Follower
 from grr_torch.projection.project import DEFAULT_TOLERANCES
 
@@ -32,11 +32,11 @@ def _starts(roadmap, count, seed):
 
 
 def _search(roadmap, follower, base, base_q, targets):
-    """Points (STEPS, B, 3) found one after the other, looking far and closely in turn, and the last step's rest."""
+    """Points (STEPS, B, 3) found one after the other, looking ever more closely in turn, and the last step's rest."""
     points = []
     for step in range(STEPS):
-        closely = np.full(len(base), step % 2 == 1)
-        base, base_q, solved = nearest_feasible(follower, roadmap.solver, base, base_q, targets, closely)
+        level = np.full(len(base), step % LEVELS)
+        base, base_q, solved = nearest_feasible(follower, roadmap.solver, base, base_q, targets, level)
         points.append(base)
     return np.stack(points), base_q, solved
 
@@ -64,18 +64,18 @@ def test_points_come_ever_nearer_to_a_target_out_of_reach(roadmap, follower):
 def test_a_target_that_the_map_solves_is_noticed(roadmap, follower):
     base, base_q = _starts(roadmap, 8, 1)
     targets = _starts(roadmap, 8, 2)[0]
-    _, _, solved = nearest_feasible(follower, roadmap.solver, base, base_q, targets, np.zeros(8, dtype=bool))
+    _, _, solved = nearest_feasible(follower, roadmap.solver, base, base_q, targets, np.zeros(8, dtype=np.int64))
     assert solved.all()
 
 
-@pytest.mark.parametrize("closely", [False, True])
-def test_a_close_look_goes_a_fifth_as_far(roadmap, follower, closely):
+@pytest.mark.parametrize("level", range(LEVELS))
+def test_a_close_look_goes_a_fifth_or_a_twentieth_as_far(roadmap, follower, level):
     base, base_q = _starts(roadmap, 40, 3)
     # so far away that no vertex is a fifth nearer
     targets = 4.0 * base / np.linalg.norm(base, axis=1, keepdims=True)
-    found, _, _ = nearest_feasible(follower, roadmap.solver, base, base_q, targets, np.full(40, closely))
+    found, _, _ = nearest_feasible(follower, roadmap.solver, base, base_q, targets, np.full(40, level))
     gone = np.linalg.norm(found - base, axis=1)
-    farthest = 0.04 if closely else 0.2
+    farthest = (0.2, 0.04, 0.01)[level]
     assert float(gone.max()) <= farthest + 1e-9
     assert int((gone > 0.9 * farthest).sum()) > 10
 
@@ -87,8 +87,8 @@ def test_what_is_much_nearer_on_the_other_side_is_gone_to(roadmap, follower):
     targets = base * np.array([-0.2, -0.2, 1.0])
     lost = ~roadmap.solve(torch.from_numpy(targets)).valid.numpy()
     assert lost.any()
-    never = np.zeros(int(lost.sum()), dtype=bool)
-    found, q, _ = nearest_feasible(follower, roadmap.solver, base[lost], base_q[lost], targets[lost], never)
+    far = np.zeros(int(lost.sum()), dtype=np.int64)
+    found, q, _ = nearest_feasible(follower, roadmap.solver, base[lost], base_q[lost], targets[lost], far)
     nearest = np.linalg.norm(vertices[None] - targets[lost, None], axis=2).min(1)
     assert bool((np.linalg.norm(found - targets[lost], axis=1) <= nearest / 0.8 + 1e-9).all())
     assert np.isfinite(q).all()
@@ -98,7 +98,7 @@ def test_what_is_much_nearer_on_the_other_side_is_gone_to(roadmap, follower):
 def test_without_a_known_configuration_one_is_found(roadmap, follower):
     base, base_q = _starts(roadmap, 6, 4)
     targets, unknown = 3.0 * base, np.full_like(base_q, np.nan)
-    found, q, _ = nearest_feasible(follower, roadmap.solver, base, unknown, targets, np.zeros(6, dtype=bool))
+    found, q, _ = nearest_feasible(follower, roadmap.solver, base, unknown, targets, np.zeros(6, dtype=np.int64))
     assert np.isfinite(q).all()
     closer = np.linalg.norm(base - targets, axis=1) - np.linalg.norm(found - targets, axis=1)
     assert bool((closer >= -1e-9).all())

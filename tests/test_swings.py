@@ -37,8 +37,8 @@ def pairs(roadmap) -> tuple[torch.Tensor, torch.Tensor]:
     return some_vertices(roadmap, PAIRS, 1), some_vertices(roadmap, PAIRS, 2)
 
 
-def _swing(roadmap, follower, q, p, goals, bounds=None, wholly=True) -> Lines:
-    return follower.swing(q, p, goals, roadmap.solver.bounds if bounds is None else bounds, wholly=wholly)
+def _swing(roadmap, follower, q, p, goals, bounds=None, most=math.inf) -> Lines:
+    return follower.swing(q, p, goals, roadmap.solver.bounds if bounds is None else bounds, most=most)
 
 
 def _at(roadmap, vertices):
@@ -54,7 +54,7 @@ def test_a_free_swing_arrives_in_time_on_its_task_and_never_collides(roadmap, fo
     arrived = np.full(len(q), np.inf)
     fractions = torch.arange(1, SUBSTEPS + 1, dtype=torch.float64)[:, None, None] / SUBSTEPS
     for step in range(1, 200):
-        lines = _swing(roadmap, follower, q, p, goals, wholly=False)
+        lines = _swing(roadmap, follower, q, p, goals, most=0.0)
         assert lines.safe.all()
         assert not lines.direct.any(), "it is not looked at to its end"
         motion = torch.from_numpy(lines.steps - q)
@@ -117,8 +117,8 @@ def test_a_swing_does_not_leave_the_bounds(roadmap, follower, pairs):
 
 def test_a_goal_that_is_not_known_is_not_swung_to(roadmap, follower, pairs):
     q, p = _at(roadmap, pairs[0])
-    for wholly in (True, False):
-        lines = _swing(roadmap, follower, q, p, np.full_like(q, np.nan), wholly=wholly)
+    for most in (math.inf, 0.0):
+        lines = _swing(roadmap, follower, q, p, np.full_like(q, np.nan), most=most)
         assert not (lines.direct | lines.safe).any()
 
 
@@ -163,6 +163,17 @@ def crowded(tmp_path_factory) -> grr_torch.Roadmap:
     return grr_torch.build(grr_torch.load_robot(path), down, points=1500, bounds=bounds, refine=False)
 
 
+@pytest.mark.parametrize(("rate", "period"), [(10.0, 5.0), (10.0, 4.0), (50.0, 1.2)])
+def test_an_arm_does_not_stay_where_a_swing_ended_however_its_target_leaps(kinova_roadmap, rate, period):
+    """The target goes round a figure eight, by more than 3 cm from one step to the next."""
+    turns = torch.arange(int(20.0 * rate), dtype=torch.float64) / rate * 2.0 * math.pi / period
+    targets = torch.stack([0.5 * turns.sin(), 0.35 * (2.0 * turns).sin(), torch.full_like(turns, 0.1)], dim=1)
+    assert float(targets.diff(dim=0).norm(dim=1).max()) > 0.03
+    q, _ = follow_targets(Teleoperator(kinova_roadmap, rate), targets)
+    moves = (q.diff(dim=0).abs().amax(1) > 1e-6).tolist()
+    assert max(map(len, "".join(" " if move else "x" for move in moves).split()), default=0) < rate
+
+
 def test_arms_whose_swings_are_refused_keep_to_their_routes(crowded, monkeypatch):
     """They neither stand still for ever nor go to and fro."""
     refused = []
@@ -170,7 +181,7 @@ def test_arms_whose_swings_are_refused_keep_to_their_routes(crowded, monkeypatch
 
     def watched(*arguments, **options):
         lines = swing(*arguments, **options)
-        refused.append(~lines.direct if options["wholly"] else ~lines.safe)
+        refused.append(~lines.direct if options["most"] > 0.0 else ~lines.safe)
         return lines
 
     monkeypatch.setattr(Follower, "swing", watched)

@@ -56,6 +56,27 @@ def test_old_input_is_refused(roadmap):
     assert teleoperator.step(point, time=5.0).status == "tracking"
 
 
+@pytest.mark.parametrize("fast", [1.02, 1.0, 0.9])
+def test_clocks_that_differ_a_little_make_no_input_old(roadmap, fast):
+    vertex = some_vertices(roadmap, 1, 4)[0]
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex], timeout=0.1)
+    for step in range(1500):
+        assert teleoperator.step(roadmap.points[vertex], time=0.02 * step / fast).status == "tracking"
+
+
+def test_one_stamp_from_the_future_makes_the_others_not_old(roadmap):
+    vertex = some_vertices(roadmap, 1, 4)[0]
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex], timeout=0.1)
+    stamps = [0.02 * step for step in range(40)]
+    stamps[20] = 3600.0
+    found = [str(teleoperator.step(roadmap.points[vertex], time=stamp).status) for stamp in stamps]
+    assert [k for k, status in enumerate(found) if status != "tracking"] == [20]
+    # a clock that was put forward is believed the second time, and what is given by the old one is old
+    later = [str(teleoperator.step(roadmap.points[vertex], time=50.0 + 0.02 * step).status) for step in range(10)]
+    assert later == ["holding"] + 9 * ["tracking"]
+    assert teleoperator.step(roadmap.points[vertex], time=1.0).status == "holding"
+
+
 def test_after_the_clutch_it_starts_where_the_arm_is(roadmap):
     first, second = some_vertices(roadmap, 2, 6)
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[first])

@@ -27,7 +27,7 @@ class Arms:
         held: (B, width) the nearest point to an unreachable target so far; NaN where there is none.
         held_q: (B, n) configurations there.
         due: (B,) steps that are left in which an arm is to come there; at least 1.
-        closely: (B,) whether it is next looked for closely round the last one.
+        level: (B,) how closely round the last one it is looked for next; 0 is far.
         sought: (B, width) the target for which it was last looked for; NaN where there is none.
         searched: (B,) whether what was found then has not been acted on yet.
         solvable: (B,) whether that target was solvable.
@@ -64,7 +64,7 @@ class Arms:
     held: Array
     held_q: Array
     due: Array
-    closely: Mask
+    level: Array
     sought: Array
     searched: Mask
     solvable: Mask
@@ -109,7 +109,7 @@ class Arms:
             held=unknown(width),
             held_q=unknown(n),
             due=np.ones(count, dtype=np.int64),
-            closely=np.zeros(count, dtype=bool),
+            level=np.zeros(count, dtype=np.int64),
             sought=unknown(width),
             searched=np.zeros(count, dtype=bool),
             solvable=np.zeros(count, dtype=bool),

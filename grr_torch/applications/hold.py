@@ -13,9 +13,10 @@ from grr_torch.applications.solve import Solver
 from grr_torch.pieces import LAST, NEXT, Array, Mask, norms
 from grr_torch.spaces.task import TaskSpace
 
-# metres around the last such point that are searched in a step, and the share of it in steps that look closely
+# metres around the last such point that are searched at most, and the share of it by level
 _AROUND = 0.2
-_CLOSE = 0.2
+_SHARES = np.array([1.0, 0.2, 0.05])
+LEVELS = len(_SHARES)
 # directions across, in space, and how much they lean to the target
 _SIDES = 6
 _LEANS = (0.5, 0.0)
@@ -29,14 +30,14 @@ _STRETCHED = 0.5
 # of the projections: what takes longer is no point to hold at
 _ITERATIONS = 5
 # a vertex is gone to instead when it is so much nearer, as a share of the distance
-_NEARER = 0.8
+NEARER = 0.8
 # of the directions across
 _ANGLES = np.arange(_SIDES)[:, None] * (2.0 * math.pi / _SIDES)
 _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 
 
 def nearest_feasible(
-    follower: Follower, solver: Solver, base: Array, base_q: Array, targets: Array, closely: Mask
+    follower: Follower, solver: Solver, base: Array, base_q: Array, targets: Array, level: Array
 ) -> tuple[Array, Array, Mask]:
     """One step of a search for the solvable point nearest to each target.
 
@@ -50,14 +51,14 @@ def nearest_feasible(
         base: (B, width) points found in the last step, or where the tools are.
         base_q: (B, n) configurations there; NaN where none is known.
         targets: (B, width) targets.
-        closely: (B,) whose points are to lie close to the last one. To look far and closely in turn, step by step, is
-            enough for points that change little, and tries half as many.
+        level: (B,) how closely to the last one points are to lie, below `LEVELS`. To look far and ever more closely
+            in turn, step by step, is enough for points that change little, and tries a third as many.
 
     Returns:
         Points (B, width), configurations (B, n), and which targets the map solves (B,).
     """
     gap = follower.task.gap_of_few
-    around = _around(follower.task, base, targets, np.where(closely, _CLOSE, 1.0).astype(base.dtype))
+    around = _around(follower.task, base, targets, _SHARES[level].astype(base.dtype))
     points = np.concatenate([base[:, None], around, targets[:, None]], axis=1)
     # as long as the arm can stay where it is, only what is nearer to the target can be better
     known = norms(base_q) < np.inf
@@ -92,7 +93,7 @@ def much_nearer(follower: Follower, solver: Solver, points: Array, targets: Arra
     task = follower.task
     if task.rotations is not None:
         distances = task.gap_of_few(solver.points.numpy()[vertices], targets)
-    return distances < _NEARER * task.gap_of_few(points, targets), vertices
+    return distances < NEARER * task.gap_of_few(points, targets), vertices
 
 
 def _solve(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Mask, Array]:

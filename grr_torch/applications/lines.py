@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from grr_torch.pieces import Array, Mask, norms, some
 from grr_torch.projection.continuity import continuous_columns
 
 # a line of more pieces is not followed at once
-_MOST_PIECES = 24
+MOST_PIECES = 24
 # a gap between points on a line of so many ε is one to another posture, whatever joins them
 _WIDEST = 2.0
 # lines no longer than this may have such gaps [rad]: it takes time to look into them
@@ -46,6 +46,17 @@ class Lines:
     collides: Mask
     safe: Mask
     direct: Mask
+
+    @staticmethod
+    def either(which: Mask, first: Lines, second: Lines) -> Lines:
+        """Of B lines, those of a mask (B,) are the first ones, in their order, and the others the second."""
+
+        def put(one: Array, other: Array) -> Array:
+            both = np.empty((len(which), *one.shape[1:]), one.dtype)
+            both[which], both[~which] = one, other
+            return both
+
+        return Lines(*(put(getattr(first, part.name), getattr(second, part.name)) for part in fields(Lines)))
 
 
 class _Aim(NamedTuple):
@@ -100,7 +111,7 @@ class Follower(Motions):
         share = np.minimum(self.share(motion), pace)
         if ((share >= SLACK) & (2.0 * norms(motion) <= self.epsilon)).all():
             return self._arrive(q, p, guesses, targets)
-        aim = self._aim(q, motion, share, _MOST_PIECES)
+        aim = self._aim(q, motion, share, MOST_PIECES)
         rows = aim.looked.nonzero()[0]
         fraction = aim.fractions[aim.looked][:, None]
         on_way = self.task.interpolate_few(p[rows], targets[rows], fraction)
@@ -113,7 +124,16 @@ class Follower(Motions):
         after = np.where(aim.near[:, None], targets, self.task.interpolate_few(p, targets, aim.fractions[:, -2, None]))
         return self._judge(aim, found, reached, after, p, targets)
 
-    def swing(self, q: Array, p: Array, goals: Array, bounds: tuple[Array, Array], *, wholly: bool) -> Lines:
+    def swing(
+        self,
+        q: Array,
+        p: Array,
+        goals: Array,
+        bounds: tuple[Array, Array],
+        *,
+        most: float = math.inf,
+        pace: Array | float = 1.0,
+    ) -> Lines:
         """Swings: motions on which the joints go straight, and the tool where that leads it, turned as the task asks.
 
         Args:
@@ -121,10 +141,11 @@ class Follower(Motions):
             p: (B, width) the points where their tools are.
             goals: (B, n) where they go, at points of the task.
             bounds: (d,) each: tools do not go below the one, nor above the other [m].
-            wholly: Whether all of the swings is looked at, or only the step, and none is `direct`.
+            most: Of a swing of more pieces, only the step is looked at, and it is not `direct`.
+            pace: (B,) the most of a swing that one step covers, above 0.
         """
         motion = self.difference(q, goals)
-        aim = self._aim(q, motion, self.share(motion), math.inf if wholly else 0.0)
+        aim = self._aim(q, motion, np.minimum(self.share(motion), pace), most)
         # no gap of ε or more is looked into
         aim = aim._replace(length=np.full(len(q), np.inf))
         guesses = (q[:, None] + aim.fractions[..., None] * motion[:, None])[aim.looked]

@@ -9,19 +9,19 @@ import torch
 
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.detours import Detours
-from grr_torch.applications.hold import much_nearer, nearest_feasible
+from grr_torch.applications.hold import LEVELS, NEARER, much_nearer, nearest_feasible
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.pursuit import Pursuit
 from grr_torch.applications.rejoin import rejoin
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
-from grr_torch.applications.steps import DETOURING, HOLDING, TRACKING, Steps
+from grr_torch.applications.steps import DETOURING, HOLDING, TRACKING, UNREACHABLE, Steps
 from grr_torch.applications.straight import Straight
 from grr_torch.pieces import Array, Mask, norms, some
 
 # vertices that are tried as a way back to the map
 _WAYS_BACK = 32
-# steps in which an arm goes to a new point to hold at: searches that look far and closely find one in four, or two
+# steps in which an arm goes to a new point to hold at
 _GRADUALLY = 4
 # steps for which an arm waits before it turns round for a target that is next to it
 _HESITATION = 2
@@ -91,7 +91,9 @@ class Pilot:
         if blind.any():
             blind &= self.follower.same_goal(targets, arms.aimed[which])
             arms.blind[which[blind]] -= 1
-        wanted = self._search(arms, which, targets, arms.holds(which) & ~blind)
+        # what was found in the last step is acted on first, however the target leaps
+        found = on_route & arms.searched[which]
+        wanted = self._search(arms, which, targets, arms.holds(which) & ~blind & ~found)
         steps, ends = Steps.none_yet(arms, which), np.full_like(arms.q[which], np.nan)
         round_ = _Round(arms, which, targets, steps, ends)
         on_way = on_route & (blind | wanted)
@@ -145,6 +147,7 @@ class Pilot:
             every = np.ones(len(fresh), dtype=bool)
             again, found[fresh], _, direct[fresh] = self.straight.steps(arms, which[fresh], targets[fresh], every)
             made.put(fresh, again)
+        direct |= self._stay(arms, which, targets, ~direct & ~valid, made)
         arms.end_detour(which[direct])
         away = ~direct & ~self._hesitate(arms, which, targets, valid & ~direct, made)
         arms.held[which[away & valid]], arms.held_q[which[away & valid]] = np.nan, np.nan
@@ -160,6 +163,22 @@ class Pilot:
             others = ~on_swing
             self.detours.set_last_vertices(arms, chosen[others], goals[others], found[away][others])
         return routed
+
+    def _stay(self, arms: Arms, which: Array, targets: Array, blocked: Mask, steps: Steps) -> Mask:
+        """Which of the arms (A,) that are `blocked` (A,) on their way to where they would hold do so where they are.
+
+        They do where it is hardly nearer to the target: a detour along the edge of reach leads away from it first.
+        """
+        rows = (blocked & arms.on_task[which] & ~arms.detours(which)).nonzero()[0]
+        gap, chosen = self.follower.task.gap_of_few, which[rows]
+        much = gap(arms.held[chosen], targets[rows]) < NEARER * gap(arms.p[chosen], targets[rows])
+        rows, chosen = rows[~much], chosen[~much]
+        arms.held[chosen], arms.held_q[chosen], arms.due[chosen] = arms.p[chosen], arms.q[chosen], 1
+        steps.q[rows], steps.goals[rows] = arms.q[chosen], arms.q[chosen]
+        steps.points[rows], steps.codes[rows] = arms.p[chosen], UNREACHABLE
+        stays = np.zeros_like(blocked)
+        stays[rows] = True
+        return stays
 
     def _swing(self, round_: _Round, rows: Array, goals_q: Array) -> Mask:
         """Sets the steps of arms, by their rows, that are free to swing to configurations (R, n): (R,)."""
@@ -190,11 +209,11 @@ class Pilot:
         # what is not to be gone to by any route must not be where a jump leads
         here = unset & self.follower.same_goal(targets, arms.barred[which])
         base_q = np.where(here[:, None], arms.q[which], arms.held_q[which])
-        closely = arms.closely[which] & ~unset
-        found = nearest_feasible(self.follower, self.solver, base, base_q, targets, closely)
+        level = np.where(unset, 0, arms.level[which])
+        found = nearest_feasible(self.follower, self.solver, base, base_q, targets, level)
         arms.due[which[norms(found[0] - arms.held[which]) != 0.0]] = _GRADUALLY
         arms.held[which], arms.held_q[which], arms.solvable[which] = found
-        arms.closely[which], arms.searched[which], arms.sought[which] = ~closely, True, targets
+        arms.level[which], arms.searched[which], arms.sought[which] = (level + 1) % LEVELS, True, targets
 
     def _lead(self, round_: _Round, routed: Mask, on_way: Mask, briefly: Mask) -> Mask:
         """Sets the steps of arms on routes: of those that have just been `routed`, or else taken back to their map.

@@ -13,6 +13,7 @@ from torch import Tensor
 from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
 from grr_torch.errors import ParameterError
+from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import tool_points
 from grr_torch.tables import read_points
@@ -64,9 +65,11 @@ def replay(teleoperator: Teleoperator, waypoints: Tensor, *, progress: Progress 
         command = teleoperator.step(target)
         seconds = time.perf_counter() - start
         q = command.configuration
-        clearance = float(robot.self_collision_distance(q)) - robot.margin
+        # of one configuration, several threads would wait for each other
+        with one_thread():
+            clearance = float(robot.self_collision_distance(q)) - robot.margin
+            tool = tool_points(robot, task, q[None])[0].numpy()
         log.append(Step(k / rate, tuple(target.tolist()), q, str(command.status), clearance, seconds))
-        tool = tool_points(robot, task, q[None])[0].numpy()
         if k >= len(waypoints) - 1 and float(task.gap_of_few(tool, target.to(q).numpy())) <= _ARRIVED:
             break
     progress("following", total, total)

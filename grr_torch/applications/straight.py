@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from grr_torch.applications.arms import Arms
-from grr_torch.applications.lines import Follower, Lines
+from grr_torch.applications.lines import MOST_PIECES, Follower, Lines
 from grr_torch.applications.solve import Solver
 from grr_torch.applications.steps import TRACKING, UNREACHABLE, Steps
 from grr_torch.pieces import Array, Mask, norms, some
@@ -89,7 +89,7 @@ class Straight:
         if len(stretched):
             motion = self.follower.difference(arms.q[which[stretched]], guesses[stretched])
             pace[stretched] = self.follower.share(motion)
-        lines = self.follower.follow(arms.q[which], arms.p[which], guesses, goals, offsets, pace)
+        lines = self._led(arms, which, goals, guesses, lost, offsets, pace)
         offsets = self.follower.difference(guesses, lines.ends)
         found = ~lost & lines.converged & ~lines.collides
         far = found & ~(norms(offsets) <= _NEAR)
@@ -97,3 +97,22 @@ class Straight:
             both = (torch.from_numpy(part[far]) for part in (lines.ends, guesses))
             found[far] = self.solver.on_map(*both).numpy()
         return lines, found, np.where(found[:, None], offsets, 0.0)
+
+    def _led(
+        self, arms: Arms, which: Array, goals: Array, guesses: Array, lost: Mask, offsets: Array, pace: Array
+    ) -> Lines:
+        """The lines of `_lines`: straight ones in the task space, but swings to where arms hold.
+
+        Along the edge of reach a straight one leads through points that it takes much self-motion to come to.
+        """
+        ways: list[Lines] = []
+        for swinging, rows in ((False, (~lost).nonzero()[0]), (True, lost.nonzero()[0])):
+            if len(rows) == 0:
+                continue
+            placed = arms.q[which[rows]], arms.p[which[rows]], guesses[rows]
+            ways.append(
+                self.follower.swing(*placed, self.solver.bounds, most=MOST_PIECES, pace=pace[rows])
+                if swinging
+                else self.follower.follow(*placed, goals[rows], offsets[rows], pace[rows])
+            )
+        return ways[0] if len(ways) == 1 else Lines.either(lost, ways[1], ways[0])

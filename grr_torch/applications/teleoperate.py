@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # of projections along lines, whose guesses are near; what takes longer is not to be gone to in a control step
 _ITERATIONS = 6
+# of how much faster than the control steps, as a share, the clock of inputs may seem to go: neither goes exactly
+_DRIFT = 0.05
 # seconds that can be looked ahead
 _FARTHEST_AHEAD = 60.0
 # what a status says, by the codes of steps
@@ -146,7 +148,7 @@ class Teleoperator:
         elif self._arms is not None:
             self._arms = Arms.at(self._follower, self._arms.q)
         self._last: Array | None = None
-        self._now, self._freshest = 0.0, math.inf
+        self._now, self._freshest, self._early = 0.0, math.inf, math.nan
 
     def step(self, target: Tensor, time: float | None = None) -> Command:
         """One control step.
@@ -157,7 +159,9 @@ class Teleoperator:
         Args:
             target: (*batch, width) points of the task space, one for each arm.
             time: When the target was given [s], on any clock. An input is as old as it has fallen behind the control
-                steps since `reset`, compared with the one that was least behind.
+                steps since `reset`, compared with the one that was least behind; 5 % of the time that has passed since
+                is put down to clocks that differ. One that comes far too early, by more than `timeout`, is refused,
+                until the next one says the same.
 
         Returns:
             The configurations to go to next, and what the arms are doing.
@@ -235,5 +239,11 @@ class Teleoperator:
         if not math.isfinite(time):
             return False
         behind = self._now - time
+        self._freshest += _DRIFT / self.rate
+        early = self._freshest < math.inf and behind < self._freshest - self.timeout
+        believed = not early or abs(behind - self._early) <= self.timeout
+        self._early = behind if early else math.nan
+        if not believed:
+            return False
         self._freshest = min(self._freshest, behind)
         return behind - self._freshest <= self.timeout

@@ -12,6 +12,7 @@ from grr_torch.applications.example_paths import middles
 from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
 from grr_torch.errors import ParameterError
+from grr_torch.pieces import one_thread
 from grr_torch.projection.project import tool_points
 
 # a target may leave what is resolved by this share of its size
@@ -125,8 +126,10 @@ class Session:
         else:
             q, status = self.configuration, "holding"
         seconds = time.perf_counter() - start
-        self.tool = tuple(tool_points(robot, self.roadmap.task, q[None])[0].tolist())
-        clearance = float(robot.self_collision_distance(q)) - robot.margin
+        # of one configuration, several threads would wait for each other
+        with one_thread():
+            self.tool = tuple(tool_points(robot, self.roadmap.task, q[None])[0].tolist())
+            clearance = float(robot.self_collision_distance(q)) - robot.margin
         step = Step(len(self.log) / self.rate if at is None else at, target, q, status, clearance, seconds)
         self.log.append(step)
         return step
