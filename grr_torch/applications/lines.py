@@ -15,7 +15,7 @@ from grr_torch.pieces import Array, Mask, norms, some
 from grr_torch.projection.continuity import continuous_columns
 
 # a line of more pieces is not followed at once
-MOST_PIECES = 24
+_MOST_PIECES = 24
 # a gap between points on a line of so many ε is one to another posture, whatever joins them
 _WIDEST = 2.0
 # lines no longer than this may have such gaps [rad]: it takes time to look into them
@@ -111,7 +111,7 @@ class Follower(Motions):
         share = np.minimum(self.share(motion), pace)
         if ((share >= SLACK) & (2.0 * norms(motion) <= self.epsilon)).all():
             return self._arrive(q, p, guesses, targets)
-        aim = self._aim(q, motion, share, MOST_PIECES)
+        aim = self._aim(q, motion, share, _MOST_PIECES)
         rows = aim.looked.nonzero()[0]
         fraction = aim.fractions[aim.looked][:, None]
         on_way = self.task.interpolate_few(p[rows], targets[rows], fraction)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from grr_torch.applications.arms import Arms
-from grr_torch.applications.lines import MOST_PIECES, Follower, Lines
+from grr_torch.applications.lines import Follower, Lines
 from grr_torch.applications.solve import Solver
 from grr_torch.applications.steps import TRACKING, UNREACHABLE, Steps
 from grr_torch.pieces import Array, Mask, norms, some
@@ -14,6 +14,8 @@ from grr_torch.pieces import Array, Mask, norms, some
 # a configuration so near the guess that led to it [rad] is on the map; less than what the solver calls off it. Where it
 # is farther, the arm is near full stretch, where it goes slowly: so much joint motion brings little
 _NEAR = 0.3
+# a swing of more pieces to where an arm holds is a detour, of which not all is looked at in every step
+_MOST_PIECES = 48
 
 
 class Straight:
@@ -111,7 +113,7 @@ class Straight:
                 continue
             placed = arms.q[which[rows]], arms.p[which[rows]], guesses[rows]
             ways.append(
-                self.follower.swing(*placed, self.solver.bounds, most=MOST_PIECES, pace=pace[rows])
+                self.follower.swing(*placed, self.solver.bounds, most=_MOST_PIECES, pace=pace[rows])
                 if swinging
                 else self.follower.follow(*placed, goals[rows], offsets[rows], pace[rows])
             )
