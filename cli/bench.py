@@ -13,8 +13,8 @@ from grr_torch.cli.bench_learning import learning
 from grr_torch.cli.bench_rotations import rotations
 from grr_torch.cli.bench_scale import scale
 from grr_torch.cli.bench_teleop import teleop
-from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
-from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+from grr_torch.cli.figures import SLOPES, FiguresFile, show_machine, slopes_cell, write_figures
+from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
     from grr_torch.experiments.roadmaps import Result
@@ -58,7 +58,7 @@ def speed(
     ] = False,
     json_file: FiguresFile = None,
 ) -> None:
-    """Print how fast everything is beside other libraries, as a Markdown table.
+    """Print how fast everything is beside other libraries, as a table.
 
     Example: grr-torch bench speed --only kinematics --only projection
 
@@ -100,7 +100,7 @@ def roadmap(
     repeats: Annotated[int, typer.Option(min=1, help="Times are medians of so many; random is built once.")] = 3,
     json_file: FiguresFile = None,
 ) -> None:
-    """Print the quality of the paper's four problems by every method, as a Markdown table.
+    """Print the quality of the paper's four problems by every method, as a table.
 
     The method random takes minutes a problem.
 
@@ -122,9 +122,9 @@ def roadmap(
         )
     write_figures(json_file, {"roadmaps": [result.to_dict() for result in results]})
     show_machine()
-    head = ["problem", "method", "resolved / reachable", "connected / edges", "smoothness", "99 %, largest slope"]
+    head = ["problem", "method", "resolved / reachable", "connected / edges", "smoothness", SLOPES]
     head += ["certified triangles", "squares", "time [s]", "the paper: connectivity, smoothness, time"]
-    typer.echo(markdown_table(head, [_roadmap_row(result) for result in results]))
+    show_table(head, [_roadmap_row(result) for result in results])
 
 
 @app.command()
@@ -139,7 +139,7 @@ def trade(
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
     json_file: FiguresFile = None,
 ) -> None:
-    """Print what secondary objectives cost in smoothness, as a Markdown table.
+    """Print what secondary objectives cost in smoothness, as a table.
 
     Example: grr-torch bench trade --robot kinova --objective clearance --weight 0.3 --weight 1
     """
@@ -153,19 +153,21 @@ def trade(
         )
     write_figures(json_file, {"trades": [row.to_dict() for row in trades]})
     names = list(trades[0].values)
-    head = ["objective", "weight", "smoothness", "connected", "certified", *(f"{name}: mean, worst" for name in names)]
+    head = ["objective", "weight", "smoothness", SLOPES, "connected", "certified"]
+    head += [f"{name}: mean, worst" for name in names]
     rows = [
         [
             row.objective or "none",
             f"{row.weight:g}",
             _number(row.quality.smoothness, 3),
+            slopes_cell(row.quality),
             f"{row.quality.connected_edges:,}",
             _share(row.quality.triangles_certified),
             *(f"{row.values[name]['mean']:.4g}, {row.values[name]['worst']:.3g}" for name in names),
         ]
         for row in trades
     ]
-    typer.echo(markdown_table(head, rows))
+    show_table(head, rows)
 
 
 def _roadmap_row(result: Result) -> list[str]:
@@ -176,7 +178,7 @@ def _roadmap_row(result: Result) -> list[str]:
         f"{quality.resolved_vertices:,} / {quality.reachable_vertices:,}",
         f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({_share(quality.connectivity)})",
         _number(quality.smoothness, 3),
-        f"{_number(quality.smoothness_p99, 1)}, {_number(quality.smoothness_max, 1)}",
+        slopes_cell(quality),
         _share(quality.triangles_certified),
         _share(quality.squares_certified),
         f"{result.seconds:.2f}",
@@ -196,7 +198,7 @@ def _show_speed(table: SpeedTable) -> None:
     versions = {**table.machine, **table.peers}
     typer.echo(", ".join(f"{name} {value}" for name, value in versions.items()) + "\n")
     rows = [[row.what, _figure(row.ours), row.unit, _beside(row), _more(row)] for row in table.rows]
-    typer.echo(markdown_table(["what", "grr-torch", "unit", "beside it", "more"], rows))
+    show_table(["what", "grr-torch", "unit", "beside it", "more"], rows)
 
 
 def _beside(row: Row) -> str:
@@ -237,7 +239,8 @@ def _show_stages(what: str, columns: dict[str, dict[str, float]]) -> None:
     values = list(columns.values())
     rows = [[stage, *(f"{column[stage]:.2f}" for column in values)] for stage in values[0]]
     rows.append(["sum", *(f"{sum(column.values()):.2f}" for column in values)])
-    typer.echo(markdown_table([what, *columns], rows) + "\n")
+    show_table([what, *columns], rows)
+    typer.echo()
 
 
 def _show_projection_cost(robot: Robot) -> None:
@@ -261,7 +264,7 @@ def _show_projection_cost(robot: Robot) -> None:
         ]
         for part in cost.parts
     ]
-    typer.echo(markdown_table(head, rows))
+    show_table(head, rows)
     for what, seconds in {
         "all of it, CPU time on one thread": cost.seconds,
         "the first four rows, if a torch call cost nothing": cost.without_calls(),

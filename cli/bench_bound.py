@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
-from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
     from grr_torch.experiments.bound import Bound
@@ -25,7 +25,7 @@ def bound(
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
     json_file: FiguresFile = None,
 ) -> None:
-    """Print how much smoother than a roadmap another could be, as a Markdown table.
+    """Print how much smoother than a roadmap another could be, as a table.
 
     Self-motion manifolds are sampled, and message passing over all edges gives a bound that no choice among the
     samples is below. Maps between the samples may be smoother, the less the closer these lie. Takes some minutes,
@@ -47,7 +47,7 @@ def bound(
     write_figures(json_file, {"file": str(file), "bounds": [result.to_dict() for result in results]})
     show_machine()
     head = ["problem", "edges", "samples, spacing [rad]", "this roadmap", "smoothest found", "bound", "time [s]"]
-    typer.echo(markdown_table(head, [_row(result) for result in results]))
+    show_table(head, [_row(result) for result in results])
 
 
 def _row(result: Bound) -> list[str]:

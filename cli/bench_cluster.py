@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 from grr_torch.cli.figures import show_machine
-from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 
 @reports_errors
@@ -17,7 +17,7 @@ def cluster(
     workers: Annotated[int, typer.Option(min=1, help="The most workers of a cluster on this machine.")] = 2,
     repeats: Annotated[int, typer.Option(min=1, help="The fastest of so many counts.")] = 3,
 ) -> None:
-    """Print what a build costs by vertex and edge, and how fast Ray's workers check its edges, as Markdown tables.
+    """Print what a build costs by vertex and edge, and how fast Ray's workers check its edges, as tables.
 
     Example: grr-torch bench cluster --robot planar_5 --task position --points 2000
     """
@@ -35,11 +35,12 @@ def cluster(
         ["refinement, a vertex", f"{vertex * cost.refinement_seconds:.1f} µs"],
         ["continuity, a checked edge", f"{edge * cost.check_seconds:.1f} µs"],
     ]
-    typer.echo(markdown_table([f"{cost.vertices:,} vertices, {cost.edges:,} edges", "cost"], rows) + "\n")
+    show_table([f"{cost.vertices:,} vertices, {cost.edges:,} edges", "cost"], rows)
+    typer.echo()
     rows = [["this process, one thread", f"{cost.check_seconds:.3f}", "", ""]]
     for count, seconds in cost.cluster_seconds.items():
         faster = f"{cost.check_seconds / seconds:.2f}×"
         rows.append(
             [f"Ray, {count} worker{'s' * (count > 1)}", f"{seconds:.3f}", faster, f"{cost.start_seconds[count]:.1f}"]
         )
-    typer.echo(markdown_table([f"continuity of {cost.checked:,} edges", "s", "speed-up", "start [s]"], rows))
+    show_table([f"continuity of {cost.checked:,} edges", "s", "speed-up", "start [s]"], rows)

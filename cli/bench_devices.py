@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
-from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
     from grr_torch.experiments.devices import Result
@@ -27,7 +27,7 @@ def devices(
     repeats: Annotated[int, typer.Option(min=1, help="Roadmaps and solving: medians of so many.")] = 3,
     json_file: FiguresFile = None,
 ) -> None:
-    """Print how long the same work takes on several devices, and what comes out, as a Markdown table.
+    """Print how long the same work takes on several devices, and what comes out, as a table.
 
     The large build has a million vertices and takes minutes.
 
@@ -51,7 +51,7 @@ def devices(
         )
     write_figures(json_file, {"work": [result.to_dict() for result in results]})
     show_machine()
-    typer.echo(markdown_table(["work", "device", "time [s]", "what comes out"], [_row(result) for result in results]))
+    show_table(["work", "device", "time [s]", "what comes out"], [_row(result) for result in results])
 
 
 def _row(result: Result) -> list[str]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
-from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+from grr_torch.cli.figures import SLOPES, FiguresFile, show_machine, slopes_cell, write_figures
+from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
     from grr_torch.experiments.effort import Best
@@ -24,7 +24,7 @@ def effort(
     ] = None,
     json_file: FiguresFile = None,
 ) -> None:
-    """Print the best refined roadmaps of many draws of found seeds, as a Markdown table.
+    """Print the best refined roadmaps of many draws of found seeds, as a table.
 
     A roadmap is left out if another one of its problem is as good in vertices, edges, smoothness and certified
     triangles, and better in one of them. Takes some minutes a problem.
@@ -37,12 +37,11 @@ def effort(
     check_outputs({"--json": json_file})
     with progress_bar() as progress:
         results = measure_effort(draws, robots=robot, tasks=task, max_slope=max_slope, progress=progress)
-    write_figures(
-        json_file, {"draws": draws, "max_slope": max_slope, "roadmaps": [result.to_dict() for result in results]}
-    )
+    told = None if max_slope is None else f"{max_slope:g}"
+    write_figures(json_file, {"draws": draws, "max_slope": told, "roadmaps": [result.to_dict() for result in results]})
     show_machine()
-    head = ["problem", "seeds", "resolved", "connected", "smoothness", "certified triangles", "time [s]"]
-    typer.echo(markdown_table(head, [_row(result) for result in results]))
+    head = ["problem", "seeds", "resolved", "connected", "smoothness", SLOPES, "certified triangles", "time [s]"]
+    show_table(head, [_row(result) for result in results])
 
 
 def _row(result: Best) -> list[str]:
@@ -54,6 +53,7 @@ def _row(result: Best) -> list[str]:
         f"{quality.resolved_vertices:,}",
         f"{quality.connected_edges:,}",
         "none" if quality.smoothness is None else f"{quality.smoothness:.4f}",
+        slopes_cell(quality),
         "" if certified is None else f"{100.0 * certified:.2f} %",
         f"{result.seconds:.2f}",
     ]

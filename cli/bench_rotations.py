@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
-from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+from grr_torch.cli.figures import SLOPES, FiguresFile, show_machine, slopes_cell, write_figures
+from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
     from grr_torch.experiments.rotations import Result
@@ -25,7 +25,7 @@ def rotations(
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
     json_file: FiguresFile = None,
 ) -> None:
-    """Print the quality and the cost of roadmaps in which rotation varies, as a Markdown table.
+    """Print the quality and the cost of roadmaps in which rotation varies, as a table.
 
     Of the cells of each, a random 20,000 triangles and 20,000 squares stand for all. Takes some minutes.
 
@@ -47,9 +47,16 @@ def rotations(
         )
     write_figures(json_file, {"roadmaps": [result.to_dict() for result in results]})
     show_machine()
-    head = ["problem", "positions × rotations", "resolved / reachable", "connected / edges", "smoothness [rad/m]"]
+    head = [
+        "problem",
+        "positions × rotations",
+        "resolved / reachable",
+        "connected / edges",
+        "smoothness [rad/m]",
+        SLOPES,
+    ]
     head += ["certified triangles", "certified squares", "time [s]", "peak memory [MiB]"]
-    typer.echo(markdown_table(head, [_row(result) for result in results]))
+    show_table(head, [_row(result) for result in results])
 
 
 def _row(result: Result) -> list[str]:
@@ -60,6 +67,7 @@ def _row(result: Result) -> list[str]:
         f"{quality.resolved_vertices:,} / {quality.reachable_vertices:,} ({_share(quality.coverage)})",
         f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({_share(quality.connectivity)})",
         "none" if quality.smoothness is None else f"{quality.smoothness:.2f}",
+        slopes_cell(quality),
         _share(quality.triangles_certified),
         _share(quality.squares_certified),
         f"{result.seconds:.1f}",

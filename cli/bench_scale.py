@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
-from grr_torch.cli.show import markdown_table, progress_bar, reports_errors
+from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
     from grr_torch.experiments.scale import Size
@@ -40,7 +40,7 @@ def scale(
     plot: Annotated[Path | None, typer.Option(help="Draw all figures into this PNG file.", metavar="FILE.png")] = None,
     json_file: FiguresFile = None,
 ) -> None:
-    """Print how time, memory, file size and opening grow with the vertices, as a Markdown table.
+    """Print how time, memory, file size and opening grow with the vertices, as a table.
 
     The last line has exponents, fitted to sizes above 10,000: 1 is a straight line. A million refined vertices take
     minutes.
@@ -66,7 +66,7 @@ def scale(
     lines = [_line(row) for row in rows]
     if powers:
         lines.append(["exponent", *(f"{powers[name]:.2f}" for name in _COLUMNS)])
-    typer.echo(markdown_table(["vertices", *(head for head, _ in _COLUMNS.values())], lines))
+    show_table(["vertices", *(head for head, _ in _COLUMNS.values())], lines)
 
 
 def _line(row: Size) -> list[str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from grr_torch.cli.figures import show_machine
-from grr_torch.cli.show import markdown_table, print_json, progress_bar, reports_errors
+from grr_torch.cli.show import print_json, progress_bar, reports_errors, show_table
 
 from grr_torch.errors import ParameterError
 
@@ -77,7 +77,7 @@ def teleop(
     head += ["smoothness [rad/m]: all, of paths that all solve", "largest step [rad]", "acceleration [rad/s²]"]
     head += ["closure [rad]", "longest stall [s]", "step [ms]"]
     order = sorted(range(len(runs)), key=lambda index: KINDS.index(runs[index].kind))
-    typer.echo(markdown_table(head, [_row(runs[index], results[index]) for index in order]))
+    show_table(head, [_row(runs[index], results[index]) for index in order])
 
 
 def _row(run: Run, result: dict[str, float | str | int | None]) -> list[str]:

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from grr_torch.cli.show import markdown_table, print_json, reports_errors
+from grr_torch.cli.show import print_json, reports_errors, show_table
 
-_SHOWN = ("hash", "robot", "task", "orientation", "status", "coverage", "connectivity", "smoothness", "seconds")
+_FIGURES = ("coverage", "connectivity", "smoothness", "smoothness_p99", "smoothness_max", "steep_edges", "seconds")
+_SHOWN = ("hash", "robot", "task", "orientation", "status", *_FIGURES)
 
 
 @reports_errors
@@ -40,7 +41,7 @@ def catalogue(
         return
     shown = list(dict.fromkeys([*_SHOWN, *([best] if best else []), *(per or [])]))
     if rows:
-        typer.echo(markdown_table(shown, [[_cell(row.get(name)) for name in shown] for row in rows]))
+        show_table(shown, [[_cell(row.get(name)) for name in shown] for row in rows])
     for row in rows:
         if row["error"] is not None:
             typer.secho(f"failed {row['hash']}: {row['error']}", err=True, fg=typer.colors.RED)

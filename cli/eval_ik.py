@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from grr_torch.cli.show import markdown_table, print_json, print_rows, progress_bar, reports_errors
+from grr_torch.cli.show import print_json, print_rows, progress_bar, reports_errors, show_table
 from grr_torch.cli.show_learning import ERROR_HEAD, WARM_HEAD, error_rows, figure_rows, warm_rows
 
 
@@ -41,5 +41,7 @@ def eval_ik(
         print_json({"machine": machine(), **evaluation.to_dict(), "warm_start": rows})
         return
     print_rows(f"{roadmap.robot.name}, {roadmap.task.kind}: {points:,} held-out points", figure_rows(evaluation))
-    typer.echo("\n" + markdown_table(ERROR_HEAD, error_rows(evaluation)))
-    typer.echo("\n" + markdown_table(WARM_HEAD, warm_rows(warm)))
+    typer.echo()
+    show_table(ERROR_HEAD, error_rows(evaluation))
+    typer.echo()
+    show_table(WARM_HEAD, warm_rows(warm))

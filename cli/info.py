@@ -100,11 +100,11 @@ def info(
         rows += [*([("refined", change)] if change else []), *traded(roadmap, figures).items()]
         print_rows(f"{file}: {robot.name}, {roadmap.task.kind}", rows)
         if len(steep):
-            print_rows(f"{len(steep)} steep edges, the steepest first", _steep_rows(roadmap, steep[:_LISTED]))
+            print_rows(f"{len(steep)} steep edges, the steepest first", _steep_rows(roadmap, steep))
         if len(left_out):
             limit = slope_bound(roadmap)
             title = f"{len(left_out)} edges left out, steeper than {limit:g} rad/m, the steepest first"
-            print_rows(title, _steep_rows(roadmap, left_out[:_LISTED]))
+            print_rows(title, _steep_rows(roadmap, left_out))
         if checks:
             results = [(f"{'✓' if check.passed else '✗'} {check.name}", check.detail) for check in checks]
             print_rows("verified" if passed else "NOT verified", results)
@@ -132,7 +132,11 @@ def _steep_rows(roadmap: Roadmap, edges: Tensor) -> list[tuple[str, str]]:
     def place(vertex: int) -> str:
         return "(" + ", ".join(f"{value:.3f}" for value in roadmap.points[vertex].tolist()) + ")"
 
-    return [
+    listed = edges[:_LISTED]
+    rows = [
         (f"{a} – {b}", f"{slope:.1f} rad/m between {place(a)} and {place(b)} m")
-        for (a, b), slope in zip(roadmap.edges[edges].tolist(), edge_slopes(roadmap, edges).tolist(), strict=True)
+        for (a, b), slope in zip(roadmap.edges[listed].tolist(), edge_slopes(roadmap, listed).tolist(), strict=True)
     ]
+    if len(edges) > len(listed):
+        rows.append(("…", f"and {len(edges) - len(listed):,} more; --json lists all"))
+    return rows

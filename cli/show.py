@@ -218,6 +218,21 @@ def numbers(option: str, text: str, names: Sequence[str]) -> list[float]:
     return values
 
 
+def show_table(head: list[str], rows: list[list[str]]) -> None:
+    """Prints a table: on a terminal one that fits it, elsewhere in Markdown."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    if not console.is_terminal:
+        typer.echo(markdown_table(head, rows))
+        return
+    table = Table(*head)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table, markup=False, highlight=False)
+
+
 def markdown_table(head: list[str], rows: list[list[str]]) -> str:
     """A table that reads well as it is, and in a README."""
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]

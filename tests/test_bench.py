@@ -151,3 +151,14 @@ def test_only_roadmaps_that_no_other_beats_are_shown():
         measure_effort(1, max_slope=0.0)
     with pytest.raises(UnknownNameError, match="fixed-rotation"):
         measure_effort(1, tasks=["pose"])
+
+
+def test_figures_of_an_infinite_bound_are_json(tmp_path):
+    out = tmp_path / "e.json"
+    words = ["bench", "effort", "--draws", "1", "--robot", "planar_5", "--task", "position", "--max-slope", "inf"]
+    result = CliRunner().invoke(app, [*words, "--json", str(out)])
+    assert result.exit_code == 0, result.output
+    figures = json.loads(out.read_text(encoding="utf-8"), parse_constant=pytest.fail)
+    assert figures["max_slope"] == "inf"
+    assert all(roadmap["smoothness_p99"] <= roadmap["smoothness_max"] for roadmap in figures["roadmaps"])
+    assert "99 %, largest slope; steep edges" in result.output

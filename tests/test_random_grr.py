@@ -47,6 +47,11 @@ def test_a_solvable_problem_is_solved_and_values_are_those_a_variable_has():
     assert not nothing.held(nothing.descend(start, random)).any()
 
 
+def test_random_grr_takes_no_seeds(planar_5):
+    with pytest.raises(ParameterError, match='seeds: got auto; valid: none with method "random"'):
+        grr_torch.build(planar_5, "position", points=50, method="random", seeds="auto")
+
+
 @pytest.mark.parametrize("options", [{"samples": 0}, {"nearest": 0}, {"samples": 10**6}])
 def test_random_grr_refuses_empty_pools(planar_5, options):
     graph = staggered_grid([(-0.4, 0.4)] * 2, 20)

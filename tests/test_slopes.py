@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import grr_torch
-from grr_torch.errors import FileFormatError, ParameterError
+from grr_torch.errors import FileFormatError, GrrWarning, ParameterError
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.options import bounded
 from grr_torch.resolution.problem import pose_problem
@@ -225,3 +225,10 @@ def test_the_commands_take_a_bound_and_list_what_is_left_out(run_cli):
     code, _, error = command("build", "--robot", "planar_5", "--max-slope", 0)
     assert code == 2
     assert "max_slope: got 0" in error
+
+
+def test_a_bound_that_leaves_most_edges_out_is_warned_of(planar_5):
+    with pytest.warns(GrrWarning, match=r"edges, most of all, are steeper than max_slope \(0.01 rad/m\)"):
+        roadmap = grr_torch.build(planar_5, "position", points=100, refine=False, max_slope=0.01)
+    assert not roadmap.connected.any()
+    assert roadmap.resolved.any()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
+from grr_torch.cli.show import show_table
 
 from grr_torch.errors import FileFormatError
 from grr_torch.tables import read_points, table_writer, unique_names
@@ -60,3 +63,20 @@ def test_a_joint_named_like_a_coordinate_gets_a_column_of_its_own():
 def test_points_of_a_file_must_be_there(tmp_path):
     with pytest.raises(FileFormatError, match="is not a file"):
         next(read_points(tmp_path / "p.csv", 2))
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_shown_tables_fit_a_terminal_and_are_markdown_elsewhere(monkeypatch, capsys, terminal):
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("FORCE_COLOR" if terminal else "NO_COLOR", "1")
+    show_table(["problem", "share [%]"], [["planar_5 fixed-rotation, refined", "99.5"], ["[b]", "1"]])
+    lines = re.sub("\x1b\\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
+    text = "".join("".join(lines).split())
+    assert "[b]" in text
+    assert "99.5" in text
+    if terminal:
+        assert max(map(len, lines)) <= 40
+    else:
+        assert lines[0] == "| problem                          | share [%] |"
+        assert set(lines[1]) == set("|- ")

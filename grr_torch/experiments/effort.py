@@ -36,14 +36,9 @@ class Best:
     def merits(self) -> tuple[float, ...]:
         """Resolved vertices, connected edges, smoothness and certified triangles; more is better in each."""
         quality = self.quality
-        smoothness, certified = quality.smoothness, quality.triangles_certified
-        worst = float("inf")
-        return (
-            quality.resolved_vertices,
-            quality.connected_edges,
-            -worst if smoothness is None else -smoothness,
-            0.0 if certified is None else certified,
-        )
+        certified = quality.triangles - quality.triangles_wound - quality.triangles_spread
+        smoothness = float("inf") if quality.smoothness is None else quality.smoothness
+        return quality.resolved_vertices, quality.connected_edges, -smoothness, certified
 
     def beats(self, other: Best) -> bool:
         """Whether it is as good in everything and better in something."""

@@ -27,7 +27,7 @@ from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.roadmap_file import load_roadmap
 from grr_torch.resolution.seeds import SeedsLike
-from grr_torch.resolution.slopes import without_steep_edges
+from grr_torch.resolution.slopes import left_out_edges, without_steep_edges
 from grr_torch.robots.crowding import crowding
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph
@@ -116,7 +116,7 @@ def build(
         "seed": seed,
         "tolerances": asdict(tolerances),
     }
-    check_options(robot, problem.task, options)
+    check_options(robot, problem.task, {**options, "seeds": seeds} if method == "random" else options)
     if resume and checkpoint is None:
         raise ParameterError("resume", "no checkpoint", "with checkpoint (--checkpoint DIR), the folder to go on from")
     what = None if checkpoint is None else describe_build(robot, problem, options)
@@ -147,6 +147,11 @@ def build(
             )
         if reachability:
             roadmap = _with_reachability(roadmap, tolerances, progress, kept)
+        if (left := len(left_out_edges(roadmap))) > int(roadmap.connected.sum()):
+            bound = f"max_slope ({problem.max_slope:g} rad/m)"
+            warnings.warn(
+                f"{left:,} edges, most of all, are steeper than {bound} and left out", GrrWarning, stacklevel=2
+            )
         if kept.folder is not None:
             roadmap.triangles(progress, kept.stage("triangles"))
             roadmap.squares(progress, kept.stage("squares"))

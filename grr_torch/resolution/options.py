@@ -56,6 +56,11 @@ def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> 
         raise ParameterError("max_slope", max_slope, "above 0, in rad/m; inf: no bound")
     if method not in METHODS:
         raise UnknownNameError("method", method, METHODS)
+    if method == "random" and options.get("seeds") is not None:
+        given = options["seeds"]
+        raise ParameterError(
+            "seeds", given if isinstance(given, str) else "some", 'none with method "random", which grows from no seeds'
+        )
     check_candidates(options["candidates"])
     if options["samples"] < 1:
         raise ParameterError("samples", options["samples"], "1 or more")

@@ -36,15 +36,15 @@ def refine(
     progress: Progress = silent,
     checkpoint: Checkpoint | None = None,
 ) -> Roadmap:
-    """Improves a roadmap: more vertices, more edges, and a smaller mean of D_q / D_p.
+    """Improves a roadmap: more vertices, edges and certified cells, and as small a mean of D_q / D_p as may be.
 
     Unresolved vertices and the ends of broken edges are tried again from all their neighbours and from random starts;
     then all configurations move along their self-motion manifolds at once. No vertex and no connected edge is lost:
     where the relaxed map breaks an edge, its ends go back part of the way, or to where they were. Edges that are broken
-    then are tried once more, in all but large maps; what joins them may be steep. With objectives, the
-    smoothest map is then relaxed once more, for the sum that `grr_torch.resolution.objectives` gives. At last, edges
-    steeper than the roadmap's parameter `max_slope`, if it has one, are left out, but for those that its parameter
-    `connectivity`, if it has that, takes.
+    then are tried once more, in all but large maps; what joins them may be steep. A map that is as smooth as it gets
+    becomes a little less so for the cells that are certified. With objectives, the smoothest map is then relaxed once
+    more, for the sum that `grr_torch.resolution.objectives` gives. At last, edges steeper than the roadmap's parameter
+    `max_slope`, if it has one, are left out, but for those that its parameter `connectivity`, if it has that, takes.
 
     Args:
         roadmap: The roadmap.

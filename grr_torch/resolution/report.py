@@ -9,29 +9,29 @@ from grr_torch.progress import Progress
 from grr_torch.resolution.checkpoint import Stage
 from grr_torch.resolution.objectives import OBJECTIVES
 from grr_torch.resolution.quality import Quality
-from grr_torch.resolution.slopes import edge_slopes
+from grr_torch.resolution.slopes import edge_slopes, steep_edges
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
 # what `parameters["refinement"]` keeps of the quality before
-BEFORE = ("resolved_vertices", "connected_edges", "smoothness", "triangles", "triangles_wound", "triangles_spread")
+BEFORE = (
+    *("resolved_vertices", "connected_edges", "smoothness", "smoothness_p99", "smoothness_max", "steep_edges"),
+    *("triangles", "triangles_wound", "triangles_spread", "squares", "squares_wound", "squares_spread"),
+)
 # figures of a map without edges or vertices
-_MAY_BE_NONE = {"smoothness", "smoothest", "mean", "worst"}
+_MAY_BE_NONE = {"smoothness", "smoothness_p99", "smoothness_max", "smoothest", "mean", "worst"}
 
 
 def before_refinement(roadmap: Roadmap, progress: Progress, kept: Stage) -> dict[str, Any]:
     """The figures of a roadmap that `parameters["refinement"]` keeps; by name, as in `Quality`."""
     slopes = edge_slopes(roadmap)
-    cells = roadmap.triangles(progress, kept)
-    figures = (
-        int(roadmap.resolved.sum()),
-        int(roadmap.connected.sum()),
-        float(slopes.mean()) if len(slopes) else None,
-        len(cells.corners),
-        int(cells.wound.sum()),
-        int(cells.spread_out.sum()),
-    )
+    figures: list[int | float | None] = [int(roadmap.resolved.sum()), int(roadmap.connected.sum())]
+    levels = [slopes.mean(), slopes.quantile(0.99), slopes.max()] if len(slopes) else []
+    figures += [float(level) for level in levels] or [None] * 3
+    figures.append(len(steep_edges(roadmap)))
+    for cells in (roadmap.triangles(progress, kept), roadmap.squares(progress)):
+        figures += [len(cells.corners), int(cells.wound.sum()), int(cells.spread_out.sum())]
     return dict(zip(BEFORE, figures, strict=True))
 
 
@@ -72,15 +72,19 @@ def summary(roadmap: Roadmap, quality: Quality) -> str:
         ("windings", "triangles_wound"),
     )
     changes = [f"{name} {before[key]:,} → {getattr(quality, key):,}" for name, key in named]
-    changes.append(f"certified triangles {_certified(before)} → {_certified(quality.to_dict())}")
+    after = quality.to_dict()
+    for cells in ("triangles", "squares"):
+        if after[cells]:
+            changes.append(f"certified {cells} {_certified(before, cells)} → {_certified(after, cells)}")
     if before["smoothness"] is not None and quality.smoothness is not None:
         changes.insert(0, f"smoothness {before['smoothness']:.3f} → {quality.smoothness:.3f}")
+        changes.insert(1, f"largest slope {before['smoothness_max']:.1f} → {quality.smoothness_max:.1f}")
     return ", ".join(changes) + f", in {before['seconds']:.2f} s"
 
 
-def _certified(figures: Mapping[str, Any]) -> str:
-    certified = figures["triangles"] - figures["triangles_wound"] - figures["triangles_spread"]
-    return f"{certified:,} of {figures['triangles']:,}"
+def _certified(figures: Mapping[str, Any], cells: str) -> str:
+    certified = figures[cells] - figures[f"{cells}_wound"] - figures[f"{cells}_spread"]
+    return f"{certified:,} of {figures[cells]:,}"
 
 
 def traded(roadmap: Roadmap, quality: Quality) -> dict[str, str]:
