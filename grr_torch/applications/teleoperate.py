@@ -45,7 +45,8 @@ class Command:
         status: (*batch,) array of text: "tracking" the target; "detouring", on a planned way to it, to where they
             will meet, or back to the map; "holding", because the input was refused, there is no way on, or the arm
             waits two steps before it sets off on a detour for a target next to it; "unreachable": the target cannot
-            be reached, and the arm goes to the nearest point that can.
+            be reached, and the arm is at or on its way to the nearest point that can, but for those close to full
+            stretch, and those hardly nearer that take much joint motion or a detour.
     """
 
     configuration: Tensor
@@ -87,7 +88,8 @@ class Teleoperator:
             max_step: The most that a joint moves in a step [rad or m], one number or (n,); by default the robot's
                 velocity limits over the rate, 1 rad/s or 1 m/s where it has none.
             acceleration_limits: Of the joints [rad/s² or m/s²], one number or (n,); by default none. An arm that has
-                them never moves so fast that it could not stop free of self-collision.
+                them never moves so fast that it could not stop free of self-collision. It is ready to stop where its
+                target is, so it falls behind one that moves by what stopping takes.
             max_jump: A target farther from the last one than this [m] is refused, until `reset`; where rotation
                 varies, a radian counts as 0.3 m.
             timeout: An input older than this [s] is refused; see `step`.
