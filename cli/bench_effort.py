@@ -37,7 +37,7 @@ def effort(
     check_outputs({"--json": json_file})
     with progress_bar() as progress:
         results = measure_effort(draws, robots=robot, tasks=task, max_slope=max_slope, progress=progress)
-    told = None if max_slope is None else f"{max_slope:g}"
+    told = "inf" if max_slope == float("inf") else max_slope
     write_figures(json_file, {"draws": draws, "max_slope": told, "roadmaps": [result.to_dict() for result in results]})
     show_machine()
     head = ["problem", "seeds", "resolved", "connected", "smoothness", SLOPES, "certified triangles", "time [s]"]

@@ -163,8 +163,6 @@ def build(
         check_outputs({"--out": out, "--record": recording}, [None if arm.preset else robot, seeds, spheres])
         box = None if bounds is None else _bounds(bounds)
         axes = None if box is None else len(box)
-        if method == "random" and seeds is not None:
-            raise ParameterError("--seeds", seeds, "none with --method random, which grows from no seeds")
         space = complete_task(arm, task, axes, **read_turning(rotation, axis))
         problem = pose_problem(arm, space, points, box, _seeds(arm, seeds), rotations)
         weights = named_numbers("--objective", objective or (), "NAME=WEIGHT, a number of 0 or more")
@@ -183,7 +181,7 @@ def build(
                 arm,
                 problem.task,
                 points=problem.graph,
-                seeds=None if method == "random" else problem.seeds,
+                seeds=None if method == "random" and seeds is None else problem.seeds,
                 candidates=CANDIDATES if candidates is None else candidates,
                 method=method,
                 samples=samples,

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from grr_torch.resolution.quality import Quality
 
 # head and cell of what stands beside connectivity, wherever it does
-SLOPES = "99 %, largest slope; steep edges"
+SLOPES = "99 %, largest slope [rad/m]; steep edges"
 
 FiguresFile = Annotated[Path | None, typer.Option("--json", help="Write all figures to this file too.")]
 
@@ -22,7 +22,7 @@ def slopes_cell(quality: Quality) -> str:
     """99th percentile and largest of D_q / D_p [rad/m], and how many edges are above ten times the median."""
     if quality.smoothness_p99 is None or quality.smoothness_max is None:
         return "none"
-    return f"{quality.smoothness_p99:.1f}, {quality.smoothness_max:.1f}; {quality.steep_edges}"
+    return f"{quality.smoothness_p99:.1f}, {quality.smoothness_max:.1f}; {quality.steep_edges:,}"
 
 
 def write_figures(file: Path | None, figures: Mapping[str, Any]) -> None:

@@ -100,10 +100,10 @@ def info(
         rows += [*([("refined", change)] if change else []), *traded(roadmap, figures).items()]
         print_rows(f"{file}: {robot.name}, {roadmap.task.kind}", rows)
         if len(steep):
-            print_rows(f"{len(steep)} steep edges, the steepest first", _steep_rows(roadmap, steep))
+            print_rows(f"{len(steep):,} steep edges, the steepest first", _steep_rows(roadmap, steep))
         if len(left_out):
             limit = slope_bound(roadmap)
-            title = f"{len(left_out)} edges left out, steeper than {limit:g} rad/m, the steepest first"
+            title = f"{len(left_out):,} edges left out, steeper than {limit:g} rad/m, the steepest first"
             print_rows(title, _steep_rows(roadmap, left_out))
         if checks:
             results = [(f"{'✓' if check.passed else '✗'} {check.name}", check.detail) for check in checks]

@@ -227,7 +227,9 @@ def show_table(head: list[str], rows: list[list[str]]) -> None:
     if not console.is_terminal:
         typer.echo(markdown_table(head, rows))
         return
-    table = Table(*head)
+    table = Table()
+    for name in head:
+        table.add_column(name, overflow="fold")
     for row in rows:
         table.add_row(*row)
     console.print(table, markup=False, highlight=False)

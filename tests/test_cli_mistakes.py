@@ -59,7 +59,7 @@ from grr_torch.cli.show import reports_errors
         ("build --robot planar_5 --seeds gap.csv", "is not a table of numbers"),
         ("build --robot planar_5 --reachability 99999999", "reachability: got 99999999"),
         ("build --robot planar_5 --out x.rrd", "--record: got x.rrd; valid: another file than that of --out"),
-        ("build --robot planar_5 --method random --seeds auto", "--seeds: got auto; valid: none with --method random"),
+        ("build --robot planar_5 --method random --seeds auto", 'seeds: got auto; valid: none with method "random"'),
         ("build --robot planar_5 --seed -1", "Invalid value for '--seed'"),
         ("info none.grr", "none.grr: is not a file"),
         ("info words.csv", "truncated or not a roadmap"),

@@ -37,8 +37,8 @@ def pairs(roadmap) -> tuple[torch.Tensor, torch.Tensor]:
     return some_vertices(roadmap, PAIRS, 1), some_vertices(roadmap, PAIRS, 2)
 
 
-def _swing(roadmap, follower, q, p, goals, bounds=None, most=math.inf) -> Lines:
-    return follower.swing(q, p, goals, roadmap.solver.bounds if bounds is None else bounds, most=most)
+def _swing(roadmap, follower, q, p, goals, bounds=None, wholly=True) -> Lines:
+    return follower.swing(q, p, goals, roadmap.solver.bounds if bounds is None else bounds, wholly=wholly)
 
 
 def _at(roadmap, vertices):
@@ -54,7 +54,7 @@ def test_a_free_swing_arrives_in_time_on_its_task_and_never_collides(roadmap, fo
     arrived = np.full(len(q), np.inf)
     fractions = torch.arange(1, SUBSTEPS + 1, dtype=torch.float64)[:, None, None] / SUBSTEPS
     for step in range(1, 200):
-        lines = _swing(roadmap, follower, q, p, goals, most=0.0)
+        lines = _swing(roadmap, follower, q, p, goals, wholly=False)
         assert lines.safe.all()
         assert not lines.direct.any(), "it is not looked at to its end"
         motion = torch.from_numpy(lines.steps - q)
@@ -117,8 +117,8 @@ def test_a_swing_does_not_leave_the_bounds(roadmap, follower, pairs):
 
 def test_a_goal_that_is_not_known_is_not_swung_to(roadmap, follower, pairs):
     q, p = _at(roadmap, pairs[0])
-    for most in (math.inf, 0.0):
-        lines = _swing(roadmap, follower, q, p, np.full_like(q, np.nan), most=most)
+    for wholly in (True, False):
+        lines = _swing(roadmap, follower, q, p, np.full_like(q, np.nan), wholly=wholly)
         assert not (lines.direct | lines.safe).any()
 
 
@@ -181,7 +181,7 @@ def test_arms_whose_swings_are_refused_keep_to_their_routes(crowded, monkeypatch
 
     def watched(*arguments, **options):
         lines = swing(*arguments, **options)
-        refused.append(~lines.direct if options["most"] > 0.0 else ~lines.safe)
+        refused.append(~lines.direct if options["wholly"] else ~lines.safe)
         return lines
 
     monkeypatch.setattr(Follower, "swing", watched)

@@ -67,9 +67,15 @@ def test_points_of_a_file_must_be_there(tmp_path):
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_shown_tables_fit_a_terminal_and_are_markdown_elsewhere(monkeypatch, capsys, terminal):
-    monkeypatch.setenv("COLUMNS", "40")
-    monkeypatch.delenv("NO_COLOR", raising=False)
+    for name in ("NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("FORCE_COLOR" if terminal else "NO_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "80")
+    figures = [f"0.{digit}{digit}{digit}{digit}{digit}" for digit in range(10)]
+    show_table([f"figure {k}" for k in range(10)], [figures])
+    whole = re.sub("\x1b\\[[0-9;]*m", "", capsys.readouterr().out)
+    assert all(whole.count(str(digit)) >= 5 for digit in range(10))
+    monkeypatch.setenv("COLUMNS", "40")
     show_table(["problem", "share [%]"], [["planar_5 fixed-rotation, refined", "99.5"], ["[b]", "1"]])
     lines = re.sub("\x1b\\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
     text = "".join("".join(lines).split())

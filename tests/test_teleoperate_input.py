@@ -64,6 +64,16 @@ def test_clocks_that_differ_a_little_make_no_input_old(roadmap, fast):
         assert teleoperator.step(roadmap.points[vertex], time=0.02 * step / fast).status == "tracking"
 
 
+def test_a_delay_that_grows_is_noticed_and_fresh_input_is_taken_again(roadmap):
+    vertex = some_vertices(roadmap, 1, 4)[0]
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex], timeout=0.1)
+    growing = [str(teleoperator.step(roadmap.points[vertex], time=0.9 * 0.02 * step).status) for step in range(200)]
+    assert growing[0] == "tracking"
+    assert growing[-1] == "holding"
+    fresh = [str(teleoperator.step(roadmap.points[vertex], time=0.02 * (200 + step)).status) for step in range(5)]
+    assert fresh[1:] == 4 * ["tracking"]
+
+
 def test_one_stamp_from_the_future_makes_the_others_not_old(roadmap):
     vertex = some_vertices(roadmap, 1, 4)[0]
     teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex], timeout=0.1)

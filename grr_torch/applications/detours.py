@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import cached_property
 
 import numpy as np
@@ -61,7 +60,7 @@ class Detours:
         for wholly, rows in ((False, under_way.nonzero()[0]), (True, (~under_way).nonzero()[0])):
             if len(rows):
                 placed = arms.q[which[rows]], arms.p[which[rows]]
-                lines = self.follower.swing(*placed, ends[rows], self.solver.bounds, most=math.inf if wholly else 0.0)
+                lines = self.follower.swing(*placed, ends[rows], self.solver.bounds, wholly=wholly)
                 steps[rows], points[rows] = lines.steps, lines.points
                 free[rows] = lines.direct if wholly else lines.safe
         # a route is left for a swing that is free, not for one that is refused

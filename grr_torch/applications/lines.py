@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,10 @@ from grr_torch.projection.continuity import continuous_columns
 
 # a line of more pieces is not followed at once
 _MOST_PIECES = 24
+# and nor is a swing of more, which is a detour then, of which not all is looked at in every step
+_MOST_OF_SWING = 48
+# how far outside of bounds a swing between two points within may lead [m]
+_BULGE = 0.02
 # a gap between points on a line of so many ε is one to another posture, whatever joins them
 _WIDEST = 2.0
 # lines no longer than this may have such gaps [rad]: it takes time to look into them
@@ -46,17 +50,6 @@ class Lines:
     collides: Mask
     safe: Mask
     direct: Mask
-
-    @staticmethod
-    def either(which: Mask, first: Lines, second: Lines) -> Lines:
-        """Of B lines, those of a mask (B,) are the first ones, in their order, and the others the second."""
-
-        def put(one: Array, other: Array) -> Array:
-            both = np.empty((len(which), *one.shape[1:]), one.dtype)
-            both[which], both[~which] = one, other
-            return both
-
-        return Lines(*(put(getattr(first, part.name), getattr(second, part.name)) for part in fields(Lines)))
 
 
 class _Aim(NamedTuple):
@@ -91,6 +84,8 @@ class Follower(Motions):
         targets: Array,
         offsets: Array | None = None,
         pace: Array | float = 1.0,
+        swinging: Mask | None = None,
+        bounds: tuple[Array, Array] | None = None,
     ) -> Lines:
         """Follows lines, all their points at once.
 
@@ -106,12 +101,16 @@ class Follower(Motions):
             offsets: (B, n) what the ends are expected to differ from their guesses by, as they did in the last step:
                 lines lead there, so that steps are not short where guesses are far off. By default nothing.
             pace: (B,) the most of a line that one step covers, above 0; from 1 on, the default, all of it.
+            swinging: (B,) those on which the joints go straight instead, as in `swing`; by default none.
+            bounds: (d,) each: where the tools of these stay, give or take 2 cm, or do not go any farther
+                than where they are [m].
         """
         motion = self.difference(q, guesses if offsets is None else guesses + offsets)
         share = np.minimum(self.share(motion), pace)
         if ((share >= SLACK) & (2.0 * norms(motion) <= self.epsilon)).all():
             return self._arrive(q, p, guesses, targets)
-        aim = self._aim(q, motion, share, _MOST_PIECES)
+        swinging = np.zeros(len(q), dtype=bool) if swinging is None else swinging
+        aim = self._aim(q, motion, share, np.where(swinging, _MOST_OF_SWING, _MOST_PIECES))
         rows = aim.looked.nonzero()[0]
         fraction = aim.fractions[aim.looked][:, None]
         on_way = self.task.interpolate_few(p[rows], targets[rows], fraction)
@@ -120,20 +119,23 @@ class Follower(Motions):
             last = np.zeros_like(aim.looked)
             last[:, -1] = True
             starts[last[aim.looked]] = guesses
-        found, reached = self._projected(aim, on_way.T, starts.T)
         after = np.where(aim.near[:, None], targets, self.task.interpolate_few(p, targets, aim.fractions[:, -2, None]))
+        inside = np.ones(len(rows), dtype=bool)
+        if some(swinging):
+            # no gap of ε or more is looked into
+            aim = aim._replace(length=np.where(swinging, np.inf, aim.length))
+            swung = swinging[rows]
+            on_way[swung] = self._tools(starts[swung])
+            after[swinging] = self._after(aim, on_way)[swinging]
+            if bounds is not None:
+                here = p[rows[swung], : self.task.dimension]
+                low, high = np.minimum(here, bounds[0]) - _BULGE, np.maximum(here, bounds[1]) + _BULGE
+                inside[swung] = self._inside(on_way[swung], (low, high))
+        found, reached = self._projected(aim, on_way.T, starts.T)
+        reached[aim.looked] &= inside
         return self._judge(aim, found, reached, after, p, targets)
 
-    def swing(
-        self,
-        q: Array,
-        p: Array,
-        goals: Array,
-        bounds: tuple[Array, Array],
-        *,
-        most: float = math.inf,
-        pace: Array | float = 1.0,
-    ) -> Lines:
+    def swing(self, q: Array, p: Array, goals: Array, bounds: tuple[Array, Array], *, wholly: bool) -> Lines:
         """Swings: motions on which the joints go straight, and the tool where that leads it, turned as the task asks.
 
         Args:
@@ -141,24 +143,34 @@ class Follower(Motions):
             p: (B, width) the points where their tools are.
             goals: (B, n) where they go, at points of the task.
             bounds: (d,) each: tools do not go below the one, nor above the other [m].
-            most: Of a swing of more pieces, only the step is looked at, and it is not `direct`.
-            pace: (B,) the most of a swing that one step covers, above 0.
+            wholly: Whether all of the swings is looked at, or only the step, and none is `direct`.
         """
         motion = self.difference(q, goals)
-        aim = self._aim(q, motion, np.minimum(self.share(motion), pace), most)
+        aim = self._aim(q, motion, self.share(motion), np.full(len(q), math.inf if wholly else 0.0))
         # no gap of ε or more is looked into
         aim = aim._replace(length=np.full(len(q), np.inf))
         guesses = (q[:, None] + aim.fractions[..., None] * motion[:, None])[aim.looked]
-        position, rotation = self.robot.forward_kinematics(torch.from_numpy(guesses))
-        points = self.task.at(position.T, rotation.permute(1, 2, 0)).numpy()
-        found, reached = self._projected(aim, points, guesses.T)
-        positions = points[: self.task.dimension].T
-        low, high = bounds[0] - self.tolerances.position, bounds[1] + self.tolerances.position
-        reached[aim.looked] &= ((positions >= low) & (positions <= high)).all(1)
-        tools = np.full((*aim.looked.shape, self.task.width), np.nan, p.dtype)
-        tools[aim.looked] = points.T
-        after = np.where(aim.near[:, None], tools[:, -1], tools[:, -2])
-        return self._judge(aim, found, reached, after, p, p)
+        points = self._tools(guesses)
+        found, reached = self._projected(aim, points.T, guesses.T)
+        slack = self.tolerances.position
+        reached[aim.looked] &= self._inside(points, (bounds[0] - slack, bounds[1] + slack))
+        return self._judge(aim, found, reached, self._after(aim, points), p, p)
+
+    def _tools(self, q: Array) -> Array:
+        """Points (M, width) where the tools are at configurations (M, n), turned as the task asks."""
+        position, rotation = self.robot.forward_kinematics(torch.from_numpy(q))
+        return self.task.at(position.T, rotation.permute(1, 2, 0)).numpy().T
+
+    def _inside(self, points: Array, bounds: tuple[Array, Array]) -> Mask:
+        """Which points (M, width) lie within bounds, (d,) or (M, d) each: (M,)."""
+        positions = points[:, : self.task.dimension]
+        return np.asarray(((positions >= bounds[0]) & (positions <= bounds[1])).all(1))
+
+    def _after(self, aim: _Aim, points: Array) -> Array:
+        """Of points (M, width) that are looked at, those where the tools are after the steps (B, width)."""
+        every = np.full((*aim.looked.shape, self.task.width), np.nan, points.dtype)
+        every[aim.looked] = points
+        return np.where(aim.near[:, None], every[:, -1], every[:, -2])
 
     def _arrive(self, q: Array, p: Array, guesses: Array, targets: Array) -> Lines:
         """`follow` for lines so short that they end within a step, and nothing on the way is looked at."""
@@ -186,20 +198,20 @@ class Follower(Motions):
         found = np.where(aim.looked[..., None], found, found[:, -1:])
         return found, np.where(aim.looked, reached, reached[:, -1:])
 
-    def _aim(self, q: Array, motion: Array, share: Array, most: float) -> _Aim:
+    def _aim(self, q: Array, motion: Array, share: Array, most: Array) -> _Aim:
         """Which points on lines with motions (B, n) are looked at: no farther than half of ε apart.
 
-        A step covers `share` (B,) of them. Of a line of more than `most` pieces, none on the way is looked at.
+        A step covers `share` (B,) of them. Of a line of more than `most` (B,) pieces, none on the way is looked at.
         """
         near, length = share >= SLACK, norms(motion)
         pieces = np.maximum(np.ceil(2.0 * length / self.epsilon), 1.0)
         short = pieces <= most
-        most = int(pieces[short].max()) if short.any() else 2
-        on_way = np.arange(1, most + 1)
-        looked = np.empty((len(q), most + 1), dtype=bool)
+        count = int(pieces[short].max()) if short.any() else 2
+        on_way = np.arange(1, count + 1)
+        looked = np.empty((len(q), count + 1), dtype=bool)
         looked[:, :-2] = short[:, None] & (on_way[:-1] < pieces[:, None])
         looked[:, -2], looked[:, -1] = ~near, True
-        fractions = np.empty((len(q), most + 1), q.dtype)
+        fractions = np.empty((len(q), count + 1), q.dtype)
         fractions[:, :-1] = on_way / pieces[:, None]
         fractions[:, -2] = np.minimum(share, 1.0)
         fractions[:, -1] = 1.0

@@ -27,6 +27,8 @@ _GRADUALLY = 4
 _HESITATION = 2
 # an arm so near [rad or m] to the map's configuration at its place is on the map
 _ON_MAP = 0.05
+# what is so much nearer to the target [m] is worth a detour, however far off that is
+_MUCH = 0.05
 
 
 class _Round(NamedTuple):
@@ -171,8 +173,9 @@ class Pilot:
         """
         rows = (blocked & arms.on_task[which] & ~arms.detours(which)).nonzero()[0]
         gap, chosen = self.follower.task.gap_of_few, which[rows]
-        much = gap(arms.held[chosen], targets[rows]) < NEARER * gap(arms.p[chosen], targets[rows])
-        rows, chosen = rows[~much], chosen[~much]
+        away = gap(arms.p[chosen], targets[rows])
+        hardly = away - gap(arms.held[chosen], targets[rows]) < np.minimum((1.0 - NEARER) * away, _MUCH)
+        rows, chosen = rows[hardly], chosen[hardly]
         arms.held[chosen], arms.held_q[chosen], arms.due[chosen] = arms.p[chosen], arms.q[chosen], 1
         steps.q[rows], steps.goals[rows] = arms.q[chosen], arms.q[chosen]
         steps.points[rows], steps.codes[rows] = arms.p[chosen], UNREACHABLE

@@ -14,8 +14,6 @@ from grr_torch.pieces import Array, Mask, norms, some
 # a configuration so near the guess that led to it [rad] is on the map; less than what the solver calls off it. Where it
 # is farther, the arm is near full stretch, where it goes slowly: so much joint motion brings little
 _NEAR = 0.3
-# a swing of more pieces to where an arm holds is a detour, of which not all is looked at in every step
-_MOST_PIECES = 48
 
 
 class Straight:
@@ -91,7 +89,9 @@ class Straight:
         if len(stretched):
             motion = self.follower.difference(arms.q[which[stretched]], guesses[stretched])
             pace[stretched] = self.follower.share(motion)
-        lines = self._led(arms, which, goals, guesses, lost, offsets, pace)
+        placed = arms.q[which], arms.p[which], guesses, goals
+        # along the edge of reach a straight line leads through points that it takes much self-motion to come to
+        lines = self.follower.follow(*placed, offsets, pace, swinging=lost, bounds=self.solver.bounds)
         offsets = self.follower.difference(guesses, lines.ends)
         found = ~lost & lines.converged & ~lines.collides
         far = found & ~(norms(offsets) <= _NEAR)
@@ -99,22 +99,3 @@ class Straight:
             both = (torch.from_numpy(part[far]) for part in (lines.ends, guesses))
             found[far] = self.solver.on_map(*both).numpy()
         return lines, found, np.where(found[:, None], offsets, 0.0)
-
-    def _led(
-        self, arms: Arms, which: Array, goals: Array, guesses: Array, lost: Mask, offsets: Array, pace: Array
-    ) -> Lines:
-        """The lines of `_lines`: straight ones in the task space, but swings to where arms hold.
-
-        Along the edge of reach a straight one leads through points that it takes much self-motion to come to.
-        """
-        ways: list[Lines] = []
-        for swinging, rows in ((False, (~lost).nonzero()[0]), (True, lost.nonzero()[0])):
-            if len(rows) == 0:
-                continue
-            placed = arms.q[which[rows]], arms.p[which[rows]], guesses[rows]
-            ways.append(
-                self.follower.swing(*placed, self.solver.bounds, most=_MOST_PIECES, pace=pace[rows])
-                if swinging
-                else self.follower.follow(*placed, goals[rows], offsets[rows], pace[rows])
-            )
-        return ways[0] if len(ways) == 1 else Lines.either(lost, ways[1], ways[0])

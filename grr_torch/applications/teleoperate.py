@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # of projections along lines, whose guesses are near; what takes longer is not to be gone to in a control step
 _ITERATIONS = 6
 # of how much faster than the control steps, as a share, the clock of inputs may seem to go: neither goes exactly
-_DRIFT = 0.05
+_DRIFT = 0.03
 # seconds that can be looked ahead
 _FARTHEST_AHEAD = 60.0
 # what a status says, by the codes of steps
@@ -161,9 +161,9 @@ class Teleoperator:
         Args:
             target: (*batch, width) points of the task space, one for each arm.
             time: When the target was given [s], on any clock. An input is as old as it has fallen behind the control
-                steps since `reset`, compared with the one that was least behind; 5 % of the time that has passed since
-                is put down to clocks that differ. One that comes far too early, by more than `timeout`, is refused,
-                until the next one says the same.
+                steps since `reset`, compared with the one that was least behind. 3 % of the time that has passed since
+                is put down to clocks that differ, so that a delay that grows no faster is not noticed. One that comes
+                too early, by more than `timeout`, is refused, until the next one says the same.
 
         Returns:
             The configurations to go to next, and what the arms are doing.
@@ -236,12 +236,12 @@ class Teleoperator:
     def _in_time(self, time: float | None) -> bool:
         """Whether an input is younger than the time-out; the control clock advances."""
         self._now += 1.0 / self.rate
+        self._freshest += _DRIFT / self.rate
         if time is None:
             return True
         if not math.isfinite(time):
             return False
         behind = self._now - time
-        self._freshest += _DRIFT / self.rate
         early = self._freshest < math.inf and behind < self._freshest - self.timeout
         believed = not early or abs(behind - self._early) <= self.timeout
         self._early = behind if early else math.nan

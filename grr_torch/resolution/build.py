@@ -27,7 +27,7 @@ from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.roadmap_file import load_roadmap
 from grr_torch.resolution.seeds import SeedsLike
-from grr_torch.resolution.slopes import left_out_edges, without_steep_edges
+from grr_torch.resolution.slopes import left_out_edges, slope_bound, without_steep_edges
 from grr_torch.robots.crowding import crowding
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.graph import Bounds, TaskGraph
@@ -147,16 +147,19 @@ def build(
             )
         if reachability:
             roadmap = _with_reachability(roadmap, tolerances, progress, kept)
-        if (left := len(left_out_edges(roadmap))) > int(roadmap.connected.sum()):
-            bound = f"max_slope ({problem.max_slope:g} rad/m)"
-            warnings.warn(
-                f"{left:,} edges, most of all, are steeper than {bound} and left out", GrrWarning, stacklevel=2
-            )
+        _warn_of_left_out(roadmap)
         if kept.folder is not None:
             roadmap.triangles(progress, kept.stage("triangles"))
             roadmap.squares(progress, kept.stage("squares"))
             kept.finish(roadmap.save)
         return roadmap
+
+
+def _warn_of_left_out(roadmap: Roadmap) -> None:
+    left, between = len(left_out_edges(roadmap)), int(roadmap.resolved[roadmap.edges].all(1).sum())
+    if 2 * left > between:
+        told = f"{left:,} of {between:,} edges are steeper than max_slope ({slope_bound(roadmap):g} rad/m) and left out"
+        warnings.warn(told, GrrWarning, stacklevel=3)
 
 
 def _with_reachability(roadmap: Roadmap, tolerances: Tolerances, progress: Progress, kept: Checkpoint) -> Roadmap:

@@ -26,7 +26,7 @@ from grr_torch.version import __version__
 
 METHODS = ("expansion", "random")
 # of what stages keep, and of how they come to it
-CHECKPOINT_VERSION = 7
+CHECKPOINT_VERSION = 8
 _MOST_STARTS = 100_000
 
 

@@ -64,7 +64,7 @@ def refine(
     """
     weights = check_objectives(roadmap.robot, objectives)
     checkpoint = checkpoint or Checkpoint()
-    told = before_refinement(roadmap, progress, checkpoint.stage("triangles"))
+    told = before_refinement(roadmap, progress, checkpoint)
     tolerances = Tolerances(**roadmap.parameters["tolerances"])
     with checkpoint.timed("refinement"):
         repaired = repair(roadmap, tolerances, seed, check, progress, checkpoint)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from grr_torch.progress import Progress
-from grr_torch.resolution.checkpoint import Stage
+from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.objectives import OBJECTIVES
 from grr_torch.resolution.quality import Quality
 from grr_torch.resolution.slopes import edge_slopes, steep_edges
@@ -23,14 +23,15 @@ BEFORE = (
 _MAY_BE_NONE = {"smoothness", "smoothness_p99", "smoothness_max", "smoothest", "mean", "worst"}
 
 
-def before_refinement(roadmap: Roadmap, progress: Progress, kept: Stage) -> dict[str, Any]:
+def before_refinement(roadmap: Roadmap, progress: Progress, checkpoint: Checkpoint) -> dict[str, Any]:
     """The figures of a roadmap that `parameters["refinement"]` keeps; by name, as in `Quality`."""
     slopes = edge_slopes(roadmap)
     figures: list[int | float | None] = [int(roadmap.resolved.sum()), int(roadmap.connected.sum())]
     levels = [slopes.mean(), slopes.quantile(0.99), slopes.max()] if len(slopes) else []
     figures += [float(level) for level in levels] or [None] * 3
     figures.append(len(steep_edges(roadmap)))
-    for cells in (roadmap.triangles(progress, kept), roadmap.squares(progress)):
+    triangles = roadmap.triangles(progress, checkpoint.stage("triangles"))
+    for cells in (triangles, roadmap.squares(progress, checkpoint.stage("squares"))):
         figures += [len(cells.corners), int(cells.wound.sum()), int(cells.spread_out.sum())]
     return dict(zip(BEFORE, figures, strict=True))
 

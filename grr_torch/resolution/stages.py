@@ -48,7 +48,8 @@ def build_stages(
             ("checking edges", 1.5 * edges),
             ("checking again", 0.7 * edges),
         ]
-        plan += [("measuring cells", cells), ("repairing", 3.0 + edges), *relaxed, *(relaxed if objectives else [])]
+        plan += [("measuring cells", cells), ("measuring cells", squares)]
+        plan += [("repairing", 3.0 + edges), *relaxed, *(relaxed if objectives else [])]
     if reachability:
         plan.append(("measuring reachability", 50.0))
     return [*plan, ("measuring cells", cells), ("measuring cells", squares), ("writing", 1.0)]

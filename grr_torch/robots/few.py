@@ -20,11 +20,10 @@ if TYPE_CHECKING:
 
 
 class Few:
-    """What `Robot.few` gives. Configurations are columns (n, N)."""
+    """A robot's kinematics, limits and self-collision, of a few configurations as columns (n, N)."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot, self._kernel = robot, robot.sphere_kernel
-        self.kinematics = robot.tree.few
+        self._robot, self.kinematics = robot, robot.tree.few
 
     @cached_property
     def limits(self) -> tuple[Array, Array] | None:
@@ -40,7 +39,7 @@ class Few:
 
     def in_self_collision(self, columns: Array) -> Mask:
         """`Robot.columns_in_self_collision`: (N,) bool."""
-        kernel = self._kernel
+        kernel = self._robot.sphere_kernel
         if kernel is None or self._are_many(kernel, columns):
             return self._robot.columns_in_self_collision(torch.from_numpy(columns)).numpy()
         return kernel.few.collides(self.kinematics.frames(columns), self._robot.margin)
@@ -48,9 +47,10 @@ class Few:
     def may_collide_near(self, columns: Array, motions: Array) -> Mask:
         """Configurations (N,) within whose motions (n, N), to either side, a self-collision is not ruled out.
 
-        It is where no two links' bounding spheres come near each other, however the joints move by as much.
+        It is where no two links' bounding spheres come near each other, however the joints move by as much; it is not
+        of more configurations than a few.
         """
-        kernel = self._kernel
+        kernel = self._robot.sphere_kernel
         if kernel is None or self._are_many(kernel, columns):
             return np.full(columns.shape[1], kernel is not None)
         return kernel.few.may_collide_near(self.kinematics.frames(columns), self._robot.margin, motions)
