@@ -76,16 +76,16 @@ def summary(roadmap: Roadmap, quality: Quality) -> str:
     after = quality.to_dict()
     for cells in ("triangles", "squares"):
         if after[cells]:
-            changes.append(f"certified {cells} {_certified(before, cells)} → {_certified(after, cells)}")
+            left = [f"{after[cells] - _certified(figures, cells):,}" for figures in (before, after)]
+            changes.append(f"uncertified of {after[cells]:,} {cells} {' → '.join(left)}")
     if before["smoothness"] is not None and quality.smoothness is not None:
         changes.insert(0, f"smoothness {before['smoothness']:.3f} → {quality.smoothness:.3f}")
         changes.insert(1, f"largest slope {before['smoothness_max']:.1f} → {quality.smoothness_max:.1f}")
     return ", ".join(changes) + f", in {before['seconds']:.2f} s"
 
 
-def _certified(figures: Mapping[str, Any], cells: str) -> str:
-    certified = figures[cells] - figures[f"{cells}_wound"] - figures[f"{cells}_spread"]
-    return f"{certified:,} of {figures[cells]:,}"
+def _certified(figures: Mapping[str, Any], cells: str) -> int:
+    return int(figures[cells] - figures[f"{cells}_wound"] - figures[f"{cells}_spread"])
 
 
 def traded(roadmap: Roadmap, quality: Quality) -> dict[str, str]:
