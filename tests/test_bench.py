@@ -161,4 +161,4 @@ def test_figures_of_an_infinite_bound_are_json(tmp_path):
     figures = json.loads(out.read_text(encoding="utf-8"), parse_constant=pytest.fail)
     assert figures["max_slope"] == "inf"
     assert all(roadmap["smoothness_p99"] <= roadmap["smoothness_max"] for roadmap in figures["roadmaps"])
-    assert "99 %, largest slope; steep edges" in result.output
+    assert "99 %, largest slope [rad/m]; steep edges" in result.output
