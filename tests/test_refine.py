@@ -31,6 +31,8 @@ def test_nothing_is_lost_and_the_map_is_smoother(name, task, points):
     assert after.max_position_error <= 1e-4 * (1.0 + 1e-6)
     assert torch.equal(check_edges(refined, Tolerances()), refined.connected)
     assert f"{before.smoothness:.3f} → {after.smoothness:.3f}" in summary(refined, after)
+    assert f"99 % of slopes below {before.smoothness_p99:.1f} → {after.smoothness_p99:.1f}" in summary(refined, after)
+    assert f"steep edges {before.steep_edges} → {after.steep_edges}" in summary(refined, after)
     # of the cells that there are in the end, those that had a broken edge before were not certified
     told, fewer = summary(refined, after), 0
     for name, then, now in zip(("triangles", "squares"), plain.cells(), refined.cells(), strict=True):

@@ -11,11 +11,9 @@ import torch
 from torch import Tensor
 
 from grr_torch.applications.teleoperate import Teleoperator
-from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
+from grr_torch.applications.teleoperation_log import Step, TeleoperationLog, tool_and_clearance
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress, silent
-from grr_torch.projection.project import tool_points
 from grr_torch.tables import read_points
 
 # after the last waypoint an arm has so long to arrive [s], and has arrived when its tool is so near [m]
@@ -53,7 +51,7 @@ def replay(teleoperator: Teleoperator, waypoints: Tensor, *, progress: Progress 
         raise ParameterError("waypoints", tuple(waypoints.shape), f"(1 or more, {width})")
     if not bool(waypoints.isfinite().all()):
         raise ParameterError("waypoints", "NaN or infinite values", "finite values")
-    robot, task = roadmap.robot, roadmap.task
+    task = roadmap.task
     waypoints = task.unit(waypoints.to(torch.float64))
     teleoperator.reset()
     log = TeleoperationLog(roadmap, rate)
@@ -65,12 +63,9 @@ def replay(teleoperator: Teleoperator, waypoints: Tensor, *, progress: Progress 
         command = teleoperator.step(target)
         seconds = time.perf_counter() - start
         q = command.configuration
-        # of one configuration, several threads would wait for each other
-        with one_thread():
-            clearance = float(robot.self_collision_distance(q)) - robot.margin
-            tool = tool_points(robot, task, q[None])[0].numpy()
+        tool, clearance = tool_and_clearance(roadmap, q)
         log.append(Step(k / rate, tuple(target.tolist()), q, str(command.status), clearance, seconds))
-        if k >= len(waypoints) - 1 and float(task.gap_of_few(tool, target.to(q).numpy())) <= _ARRIVED:
+        if k >= len(waypoints) - 1 and float(task.gap_of_few(tool.numpy(), target.to(q).numpy())) <= _ARRIVED:
             break
     progress("following", total, total)
     return log

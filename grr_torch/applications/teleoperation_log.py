@@ -16,6 +16,8 @@ from torch import Tensor
 from grr_torch.applications.teleoperate import STATUSES
 from grr_torch.errors import ParameterError
 from grr_torch.output import atomic_write
+from grr_torch.pieces import one_thread
+from grr_torch.projection.project import tool_points
 from grr_torch.resolution.roadmap import Roadmap
 
 # an arm stalls when no joint moves more than this in a step [rad or m] though its tool has farther to go than that [m]
@@ -83,6 +85,14 @@ class Summary:
     def to_dict(self) -> dict[str, Any]:
         """As JSON has it."""
         return asdict(self)
+
+
+def tool_and_clearance(roadmap: Roadmap, q: Tensor) -> tuple[Tensor, float]:
+    """Where the tool (width,) is at a configuration (n,), and its self-collision distance, less the margin [m]."""
+    # of one configuration, several threads would wait for each other
+    with one_thread():
+        tool = tool_points(roadmap.robot, roadmap.task, q[None])[0]
+        return tool, float(roadmap.robot.self_collision_distance(q)) - roadmap.robot.margin
 
 
 class TeleoperationLog:

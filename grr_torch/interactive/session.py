@@ -10,10 +10,8 @@ from torch import Tensor
 
 from grr_torch.applications.example_paths import middles
 from grr_torch.applications.teleoperate import Teleoperator
-from grr_torch.applications.teleoperation_log import Step, TeleoperationLog
+from grr_torch.applications.teleoperation_log import Step, TeleoperationLog, tool_and_clearance
 from grr_torch.errors import ParameterError
-from grr_torch.pieces import one_thread
-from grr_torch.projection.project import tool_points
 
 # a target may leave what is resolved by this share of its size
 _BEYOND = 0.25
@@ -118,7 +116,7 @@ class Session:
         if self._rearm:
             self._rearm = False
             self.teleoperator.reset()
-        target, robot = self._target, self.roadmap.robot
+        target = self._target
         start = time.perf_counter()
         if self._engaged:
             command = self.teleoperator.step(torch.tensor(target, dtype=torch.float64))
@@ -126,10 +124,8 @@ class Session:
         else:
             q, status = self.configuration, "holding"
         seconds = time.perf_counter() - start
-        # of one configuration, several threads would wait for each other
-        with one_thread():
-            self.tool = tuple(tool_points(robot, self.roadmap.task, q[None])[0].tolist())
-            clearance = float(robot.self_collision_distance(q)) - robot.margin
+        tool, clearance = tool_and_clearance(self.roadmap, q)
+        self.tool = tuple(tool.tolist())
         step = Step(len(self.log) / self.rate if at is None else at, target, q, status, clearance, seconds)
         self.log.append(step)
         return step

@@ -19,6 +19,12 @@ BEFORE = (
     *("resolved_vertices", "connected_edges", "smoothness", "smoothness_p99", "smoothness_max", "steep_edges"),
     *("triangles", "triangles_wound", "triangles_spread", "squares", "squares_wound", "squares_spread"),
 )
+# what is told of slopes: name, figure and digits
+_SLOPES = (
+    ("smoothness", "smoothness", ".3f"),
+    ("99 % of slopes below", "smoothness_p99", ".1f"),
+    ("largest", "smoothness_max", ".1f"),
+)
 # figures of a map without edges or vertices
 _MAY_BE_NONE = {"smoothness", "smoothness_p99", "smoothness_max", "smoothest", "mean", "worst"}
 
@@ -70,6 +76,7 @@ def summary(roadmap: Roadmap, quality: Quality) -> str:
     named = (
         ("vertices", "resolved_vertices"),
         ("edges", "connected_edges"),
+        ("steep edges", "steep_edges"),
         ("windings", "triangles_wound"),
     )
     changes = [f"{name} {before[key]:,} → {getattr(quality, key):,}" for name, key in named]
@@ -79,8 +86,8 @@ def summary(roadmap: Roadmap, quality: Quality) -> str:
             left = [f"{after[cells] - _certified(figures, cells):,}" for figures in (before, after)]
             changes.append(f"uncertified of {after[cells]:,} {cells} {' → '.join(left)}")
     if before["smoothness"] is not None and quality.smoothness is not None:
-        changes.insert(0, f"smoothness {before['smoothness']:.3f} → {quality.smoothness:.3f}")
-        changes.insert(1, f"largest slope {before['smoothness_max']:.1f} → {quality.smoothness_max:.1f}")
+        slopes = [f"{name} {before[key]:{digits}} → {after[key]:{digits}}" for name, key, digits in _SLOPES]
+        changes = [*slopes, *changes]
     return ", ".join(changes) + f", in {before['seconds']:.2f} s"
 
 
