@@ -141,14 +141,12 @@ class Arms:
 
     def look(self, follower: Follower, which: Array) -> None:
         """Finds out where the tools of some arms (A,) are, and whether these arms are on their task."""
-        robot, task, q = follower.robot, follower.task, torch.from_numpy(self.q[which])
-        position, rotation = robot.forward_kinematics(q)
-        columns = position.T, rotation.permute(1, 2, 0)
-        points = task.at(*columns)
-        error = task.error(points, *columns)
-        turned = task.residuals(error)[1] <= _OFF_TASK * follower.tolerances.rotation
-        self.p[which] = points.T.numpy()
-        self.on_task[which] = (turned & robot.within_limits(q) & ~robot.in_self_collision(q)).numpy()
+        robot, task, q = follower.robot.few, follower.task, np.ascontiguousarray(self.q[which].T)
+        position, rotation = robot.tool_pose(q)
+        points = task.at(torch.from_numpy(position), torch.from_numpy(rotation)).numpy()
+        turned = norms(task.error_of_few(points, position, rotation)[task.dimension :].T)
+        self.p[which], self.on_task[which] = points.T, turned <= _OFF_TASK * follower.tolerances.rotation
+        self.on_task[which] &= robot.within_limits(q) & ~robot.in_self_collision(q)
 
     def holds(self, which: Array) -> Mask:
         """Whether arms (A,) have a point to hold at: (A,)."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -97,13 +96,24 @@ def much_nearer(follower: Follower, solver: Solver, points: Array, targets: Arra
 
 
 def _solve(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Mask, Array]:
-    """Configurations (N, n) of the map at points (N, width), which are valid, and how far their guesses were off."""
-    guesses, codes = solver.guess(torch.from_numpy(points).to(torch.float64), certified=False)
-    guesses = guesses.to(solver.points.dtype)
-    tolerances = replace(solver.tolerances, iterations=_ITERATIONS)
-    columns, codes = solver.solve_from(torch.from_numpy(points.T), guesses, codes, tolerances)
-    q = columns.T.numpy()
-    return q, codes.numpy() <= 1, follower.distance(q, guesses.numpy())
+    """Configurations (N, n) of the map at points (N, width), which are valid, and how far their guesses were off.
+
+    `Solver.solve_from` for arrays.
+    """
+    guesses, codes = (
+        part.numpy() for part in solver.guess(torch.from_numpy(points.astype(np.float64)), certified=False)
+    )
+    guesses, rows = guesses.astype(points.dtype), (codes <= 1).nonzero()[0]
+    q, strayed = np.full_like(guesses, np.nan), np.full(len(points), np.nan, points.dtype)
+    solved, valid = follower.solved(points[rows].T, guesses[rows].T, _ITERATIONS)
+    rows, solved = rows[valid], solved.T[valid]
+    kept = solver.on_map(torch.from_numpy(solved), torch.from_numpy(guesses[rows])).numpy()
+    rows, solved = rows[kept], solved[kept]
+    free = ~follower.robot.few.in_self_collision(np.ascontiguousarray(solved.T))
+    rows = rows[free]
+    q[rows] = solved[free]
+    strayed[rows] = follower.distance(q[rows], guesses[rows])
+    return q, np.isfinite(strayed), strayed
 
 
 def _around(task: TaskSpace, base: Array, targets: Array, close: Array) -> Array:

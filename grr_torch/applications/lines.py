@@ -158,8 +158,8 @@ class Follower(Motions):
 
     def _tools(self, q: Array) -> Array:
         """Points (M, width) where the tools are at configurations (M, n), turned as the task asks."""
-        position, rotation = self.robot.forward_kinematics(torch.from_numpy(q))
-        return self.task.at(position.T, rotation.permute(1, 2, 0)).numpy().T
+        pose = self.robot.few.tool_pose(np.ascontiguousarray(q.T))
+        return self.task.at(*(torch.from_numpy(part) for part in pose)).numpy().T
 
     def _inside(self, points: Array, bounds: tuple[Array, Array]) -> Mask:
         """Which points (M, width) lie within bounds, (d,) or (M, d) each: (M,)."""

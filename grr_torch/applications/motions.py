@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -63,12 +63,13 @@ class Motions:
         """(…,) how many control steps motions (…, n) take; of equal ones, one of less motion in all is less."""
         return (np.abs(motion) / self._longest).max(-1) + _TIE * norms(motion / self._longest)
 
-    def solved(self, points: Array, guesses: Array) -> tuple[Array, Mask]:
-        """`project_columns` for arrays, self-collision left open."""
+    def solved(self, points: Array, guesses: Array, iterations: int | None = None) -> tuple[Array, Mask]:
+        """`project_columns` for arrays, self-collision left open; in fewer `iterations` than usual, if given."""
+        tolerances = self.tolerances if iterations is None else replace(self.tolerances, iterations=iterations)
         if guesses.shape[1] <= FEW:
-            return project_few(self.robot, self.task, self.tolerances, points, guesses)
+            return project_few(self.robot, self.task, tolerances, points, guesses)
         columns = torch.from_numpy(points), torch.from_numpy(guesses)
-        solved, valid = project_columns(self.robot, self.task, *columns, self.tolerances, check_collision=False)
+        solved, valid = project_columns(self.robot, self.task, *columns, tolerances, check_collision=False)
         return solved.numpy(), valid.numpy()
 
     def limited(self, q: Array, towards: Array) -> tuple[Array, Mask]:

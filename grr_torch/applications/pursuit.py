@@ -71,7 +71,8 @@ class Pursuit:
         arms.meets[which[~moves]] = np.nan
         due &= moves
         arms.looks_in[which] = np.where(due, arms.looks_in[which] - 1, 0)
-        rows = (due & (arms.looks_in[which] <= 0)).nonzero()[0]
+        # not in the steps in which points to hold at are searched for
+        rows = (due & (arms.looks_in[which] <= 0)).nonzero()[0] if arms.turn else ()
         if len(rows):
             arms.looks_in[which[rows]] = _EVERY
             self._look(arms, which[rows], targets[rows], behind[rows])

@@ -150,9 +150,7 @@ class Solver:
             q[:, failed[good]], codes[failed[good]] = again[:, good], _UNCERTIFIED
         return q, codes
 
-    def solve_from(
-        self, targets: Tensor, guesses: Tensor, codes: Tensor, tolerances: Tolerances | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def solve_from(self, targets: Tensor, guesses: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
         """`solve_columns` from what `guess` gave."""
         near = (codes <= _UNCERTIFIED).nonzero()[:, 0].to(targets.device)
         q = targets.new_full((self.robot.n, len(guesses)), torch.nan)
@@ -161,7 +159,7 @@ class Solver:
             self.task,
             targets[:, near],
             guesses.to(targets)[near].T.contiguous(),
-            tolerances or self.tolerances,
+            self.tolerances,
             check_collision=False,
         )
         codes[near[~valid].cpu()] = _NOT_CONVERGED

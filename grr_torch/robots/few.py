@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from grr_torch.robots.robot import Robot
     from grr_torch.robots.self_collision import SphereKernel
 
+# excess over a joint limit that is forgiven [rad or m]
+LIMITS_SLACK = 1e-9
+
 
 class Few:
     """A robot's kinematics, limits and self-collision, of a few configurations as columns (n, N)."""
@@ -36,6 +39,18 @@ class Few:
         """(n, 1) a whole turn of continuous joints, 0 of others."""
         robot = self._robot
         return 2.0 * math.pi * robot.continuous.numpy()[:, None].astype(robot.lower.numpy().dtype)
+
+    def tool_pose(self, columns: Array) -> tuple[Array, Array]:
+        """Positions (3, N) and rotations (3, 3, N) of the tool."""
+        tool = self.kinematics.frames(columns)[-2]
+        return tool[3], tool[:3].transpose(1, 0, 2)
+
+    def within_limits(self, columns: Array) -> Mask:
+        """`Robot.within_limits`: (N,) bool."""
+        if self.limits is None:
+            return np.ones(columns.shape[1], dtype=bool)
+        lower, upper = self.limits
+        return np.asarray(((columns >= lower - LIMITS_SLACK) & (columns <= upper + LIMITS_SLACK)).all(0))
 
     def in_self_collision(self, columns: Array) -> Mask:
         """`Robot.columns_in_self_collision`: (N,) bool."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import are_few, in_pieces, piece
 from grr_torch.robots.chain import serial_chain
-from grr_torch.robots.few import Few
+from grr_torch.robots.few import LIMITS_SLACK, Few
 from grr_torch.robots.kinematics import KinematicTree
 from grr_torch.robots.presets import Preset
 from grr_torch.robots.self_collision import SphereKernel
@@ -217,7 +217,7 @@ class Robot:
         (touching,) = self._of_frames(lambda frames: (kernel.touching(frames, self.margin),), columns)
         return dict(zip(kernel.names, touching.double().mean(1).tolist(), strict=True))
 
-    def within_limits(self, q: Tensor, tolerance: float = 1e-9) -> Tensor:
+    def within_limits(self, q: Tensor, tolerance: float = LIMITS_SLACK) -> Tensor:
         """Whether every joint lies within its position limits: (*batch,) bool.
 
         Args:
