@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from grr_torch.cli.show import numbers
-
-from grr_torch.errors import ParameterError
+from grr_torch.cli.options import named_numbers, numbers
 
 if TYPE_CHECKING:
     from grr_torch.robots.robot import Robot
@@ -77,21 +75,3 @@ def read_turning(rotation: str | None, axis: str | None) -> dict[str, list[float
         "rpy": None if rotation is None else numbers("--rotation", rotation, ("roll", "pitch", "yaw")),
         "axis": None if axis is None else numbers("--axis", axis, ("x", "y", "z")),
     }
-
-
-def named_numbers(option: str, items: Sequence[str], valid: str) -> dict[str, float]:
-    """The numbers that a repeatable option NAME=NUMBER gives.
-
-    Raises:
-        ParameterError: One is no number, or given twice.
-    """
-    found: dict[str, float] = {}
-    for item in items:
-        name, _, value = item.partition("=")
-        if name in found:
-            raise ParameterError(option, repr(item), f"one value for '{name}'")
-        try:
-            found[name] = float(value)
-        except ValueError as error:
-            raise ParameterError(option, repr(item), valid) from error
-    return found

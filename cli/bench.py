@@ -13,7 +13,8 @@ from grr_torch.cli.bench_learning import learning
 from grr_torch.cli.bench_rotations import rotations
 from grr_torch.cli.bench_scale import scale
 from grr_torch.cli.bench_teleop import teleop
-from grr_torch.cli.figures import SLOPES, FiguresFile, show_machine, slopes_cell, write_figures
+from grr_torch.cli.figures import SLOPES, FiguresFile, share, show_machine, slopes_cell, write_figures
+from grr_torch.cli.options import check_unused
 from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def speed(
     peers: Annotated[
         str | None, typer.Option(help="Of pytorch-kinematics,Pinocchio,Klampt; by default those that are installed.")
     ] = None,
-    repeats: Annotated[int, typer.Option(help="Medians are taken over so many.")] = 7,
+    repeats: Annotated[int | None, typer.Option(help="Medians are taken over so many; 7 by default.")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="For torch; by default what torch takes.")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, …")] = "cpu",
     profile: Annotated[
@@ -69,6 +70,8 @@ def speed(
     from grr_torch.experiments.speed import measure_speed
     from grr_torch.output import check_outputs
 
+    if profile:
+        check_unused({"--only": only, "--peers": peers, "--repeats": repeats, "--json": json_file}, "--profile")
     if threads is not None:
         torch.set_num_threads(threads)
     if profile:
@@ -79,7 +82,7 @@ def speed(
         table = measure_speed(
             sections=only,
             peers=None if peers is None else [name.strip() for name in peers.split(",") if name.strip()],
-            repeats=repeats,
+            repeats=7 if repeats is None else repeats,
             device=device,
             progress=progress,
         )
@@ -162,7 +165,7 @@ def trade(
             _number(row.quality.smoothness, 3),
             slopes_cell(row.quality),
             f"{row.quality.connected_edges:,}",
-            _share(row.quality.triangles_certified),
+            share(row.quality.triangles_certified),
             *(f"{row.values[name]['mean']:.4g}, {row.values[name]['worst']:.3g}" for name in names),
         ]
         for row in trades
@@ -176,18 +179,14 @@ def _roadmap_row(result: Result) -> list[str]:
         f"{result.robot} {result.task}",
         f"{result.method}{', refined' if result.refined else ''}",
         f"{quality.resolved_vertices:,} / {quality.reachable_vertices:,}",
-        f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({_share(quality.connectivity)})",
+        f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({share(quality.connectivity)})",
         _number(quality.smoothness, 3),
         slopes_cell(quality),
-        _share(quality.triangles_certified),
-        _share(quality.squares_certified),
+        share(quality.triangles_certified),
+        share(quality.squares_certified),
         f"{result.seconds:.2f}",
         "" if paper is None else f"{paper[0]} %, {paper[1]}, {60.0 * paper[2]:.0f} s",
     ]
-
-
-def _share(value: float | None) -> str:
-    return "" if value is None else f"{100.0 * value:.2f} %"
 
 
 def _number(value: float | None, digits: int) -> str:

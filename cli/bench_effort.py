@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from grr_torch.cli.figures import SLOPES, FiguresFile, show_machine, slopes_cell, write_figures
+from grr_torch.cli.figures import SLOPES, FiguresFile, share, show_machine, slopes_cell, write_figures
 from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ def effort(
 
 def _row(result: Best) -> list[str]:
     quality = result.quality
-    certified = quality.triangles_certified
     return [
         f"{result.robot} {result.task}",
         "preset" if result.seed is None else f"auto, --seed {result.seed}",
@@ -54,6 +53,6 @@ def _row(result: Best) -> list[str]:
         f"{quality.connected_edges:,}",
         "none" if quality.smoothness is None else f"{quality.smoothness:.4f}",
         slopes_cell(quality),
-        "" if certified is None else f"{100.0 * certified:.2f} %",
+        share(quality.triangles_certified),
         f"{result.seconds:.2f}",
     ]

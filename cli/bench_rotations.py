@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from grr_torch.cli.figures import SLOPES, FiguresFile, show_machine, slopes_cell, write_figures
+from grr_torch.cli.figures import SLOPES, FiguresFile, share, show_machine, slopes_cell, write_figures
 from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
@@ -64,16 +64,12 @@ def _row(result: Result) -> list[str]:
     return [
         f"{result.problem}{', refined' if result.refined else ''}",
         f"{result.positions:,} × {result.rotations:,}",
-        f"{quality.resolved_vertices:,} / {quality.reachable_vertices:,} ({_share(quality.coverage)})",
-        f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({_share(quality.connectivity)})",
+        f"{quality.resolved_vertices:,} / {quality.reachable_vertices:,} ({share(quality.coverage)})",
+        f"{quality.connected_edges:,} / {quality.reachable_edges:,} ({share(quality.connectivity)})",
         "none" if quality.smoothness is None else f"{quality.smoothness:.2f}",
         slopes_cell(quality),
-        _share(quality.triangles_certified),
-        _share(quality.squares_certified),
+        share(quality.triangles_certified),
+        share(quality.squares_certified),
         f"{result.seconds:.1f}",
         f"{result.memory:,.0f}",
     ]
-
-
-def _share(value: float | None) -> str:
-    return "" if value is None else f"{100.0 * value:.2f} %"

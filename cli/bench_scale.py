@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from grr_torch.cli.figures import FiguresFile, show_machine, write_figures
+from grr_torch.cli.options import check_ending
 from grr_torch.cli.show import progress_bar, reports_errors, show_table
 
 if TYPE_CHECKING:
@@ -33,7 +35,11 @@ def scale(
     robot: Annotated[str, typer.Option(help="A bundled robot.")] = "kinova",
     task: Annotated[str | None, typer.Option(help="A task of its preset; the default one by default.")] = None,
     points: Annotated[
-        list[int] | None, typer.Option(help="Vertices asked for; repeatable; 1000, 10000, 100000, 1000000 by default.")
+        list[int] | None,
+        typer.Option(
+            help="Vertices asked for, or where rotation varies positions, each in as many rotations as the preset has; "
+            "repeatable; 1000, 10000, 100000, 1000000 by default."
+        ),
     ] = None,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Whether roadmaps are refined.")] = True,
     repeats: Annotated[int, typer.Option(min=1, help="Opening and solving: medians over so many processes.")] = 3,
@@ -42,26 +48,25 @@ def scale(
 ) -> None:
     """Print how time, memory, file size and opening grow with the vertices, as a table.
 
-    The last line has exponents, fitted to sizes above 10,000: 1 is a straight line. A million refined vertices take
-    minutes.
+    CPU is the processor time of the build, in all its processes; peak is the memory of the first of them. The last
+    line has exponents, fitted to sizes above 10,000: 1 is a straight line. A million refined vertices take minutes.
 
     Example: grr-torch bench scale --points 1000 --points 10000 --points 100000 --plot scale.png
     """
-    from grr_torch.errors import ParameterError
     from grr_torch.experiments.scale import SIZES, exponents, measure_scale
     from grr_torch.experiments.scale import plot as draw
     from grr_torch.output import atomic_write, check_outputs
 
-    if plot is not None and plot.suffix != ".png":
-        raise ParameterError("--plot", plot, "a file that ends in .png")
     check_outputs({"--plot": plot, "--json": json_file})
+    check_ending("--plot", plot, ".png")
     with progress_bar() as progress:
         rows = measure_scale(robot, task, sizes=points or SIZES, refine=refine, repeats=repeats, progress=progress)
     powers = exponents(rows)
-    write_figures(json_file, {"sizes": [row.__dict__ for row in rows], "exponents": powers})
-    if plot is not None:
-        with atomic_write(plot) as path:
-            draw(rows, path)
+    # both files appear together, or neither does
+    with ExitStack() as stack:
+        if plot is not None:
+            draw(rows, stack.enter_context(atomic_write(plot)))
+        write_figures(json_file, {"sizes": [row.__dict__ for row in rows], "exponents": powers})
     show_machine()
     lines = [_line(row) for row in rows]
     if powers:

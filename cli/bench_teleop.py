@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from grr_torch.cli.figures import show_machine
+from grr_torch.cli.options import check_ending
 from grr_torch.cli.show import print_json, progress_bar, reports_errors, show_table
 
 from grr_torch.errors import ParameterError
@@ -23,7 +24,9 @@ def teleop(
     ] = None,
     paths: Annotated[
         Path | None,
-        typer.Option(help="Paths to follow: an .npz with an array (paths, waypoints, 3) for each kind of path."),
+        typer.Option(
+            help="Paths to follow: an .npz with an array (paths, waypoints, numbers of a point) for each kind of path."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -58,17 +61,15 @@ def teleop(
     if not names:
         raise ParameterError("--methods", repr(methods), "some of expansion, random, newton, relaxed")
     check_methods(names)
-    if out is not None:
-        if out.suffix != ".npz":
-            raise ParameterError("--out", out, "a file that ends in .npz")
-        check_outputs({"--out": out}, [file, paths])
+    check_outputs({"--out": out}, [file, paths])
+    check_ending("--out", out, ".npz")
     with progress_bar() as progress:
         roadmap = Roadmap.load(file) if file else build(load_robot("kinova"), "fixed-rotation", progress=progress)
         given = None if paths is None else read_paths(paths, roadmap.task.width)
         runs = run_teleoperation(roadmap, paths=given, methods=names, count=count, seed=seed, progress=progress)
+    results = aggregate(runs)
     if out is not None:
         save_trajectories(runs, out)
-    results = aggregate(runs)
     if as_json:
         print_json({"machine": machine(), "runs": results})
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from grr_torch.cli.arm import (
@@ -20,9 +20,9 @@ from grr_torch.cli.arm import (
     TaskKind,
     Tool,
     load_arm,
-    named_numbers,
     read_turning,
 )
+from grr_torch.cli.options import check_ending, check_unused, named_numbers, some_numbers
 from grr_torch.cli.show import (
     ENGINES,
     bounds_of,
@@ -35,6 +35,10 @@ from grr_torch.cli.show import (
 )
 
 from grr_torch.errors import ParameterError, UnknownNameError
+
+if TYPE_CHECKING:
+    from grr_torch.resolution.quality import Quality
+    from grr_torch.resolution.roadmap import Roadmap
 
 
 @reports_errors
@@ -61,7 +65,9 @@ def build(
         int | None, typer.Option(help="Sets of seeds that are compared where seeds are found; more may do better.")
     ] = None,
     method: Annotated[str, typer.Option(help="expansion, or random: the baseline, in minutes.")] = "expansion",
-    samples: Annotated[int, typer.Option(help="Random configurations of a vertex, for --method random.")] = 100,
+    samples: Annotated[
+        int | None, typer.Option(help="Random configurations of a vertex, for --method random; 100 by default.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Roadmap file; by default ROBOT.grr. Replaced if it exists.")] = None,
     record: Annotated[Path | None, typer.Option(help="Recording; by default beside the roadmap, .rrd.")] = None,
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
@@ -136,14 +142,13 @@ def build(
     Example: grr-torch build --robot arm.urdf --tool flange --points 2000 --bounds -0.8 0.8 -0.8 0.8 0 1.2
     --seeds seeds.csv
     """
-    from grr_torch.applications.routes import part_sizes
     from grr_torch.output import atomic_write, check_outputs
-    from grr_torch.resolution.auto_seeds import CANDIDATES
     from grr_torch.resolution.build import build as build_roadmap
     from grr_torch.resolution.problem import complete_task, pose_problem
-    from grr_torch.resolution.report import summary, traded
     from grr_torch.resolution.stages import build_stages
 
+    if no_record:
+        check_unused({"--record": record}, "--no-record")
     with progress_bar() as progress, _edge_check(engine, address, device) as check:
         progress("loading the robot", 0, 1)
         arm = load_arm(
@@ -161,6 +166,8 @@ def build(
         out = out or Path(f"{Path(robot).stem}.grr")
         recording = None if no_record else record or out.parent / f"{out.stem}.rrd"
         check_outputs({"--out": out, "--record": recording}, [None if arm.preset else robot, seeds, spheres])
+        check_ending("--out", out, ".grr")
+        check_ending("--record", recording, ".rrd")
         box = None if bounds is None else _bounds(bounds)
         axes = None if box is None else len(box)
         space = complete_task(arm, task, axes, **read_turning(rotation, axis))
@@ -182,7 +189,7 @@ def build(
                 problem.task,
                 points=problem.graph,
                 seeds=None if method == "random" and seeds is None else problem.seeds,
-                candidates=CANDIDATES if candidates is None else candidates,
+                candidates=candidates,
                 method=method,
                 samples=samples,
                 neighbours=neighbours,
@@ -212,6 +219,13 @@ def build(
 
                 record_roadmap(roadmap, stack.enter_context(atomic_write(recording)))
         progress("writing", 2, 2)
+    _show(roadmap, figures, out, recording, as_json)
+
+
+def _show(roadmap: Roadmap, figures: Quality, out: Path, recording: Path | None, as_json: bool) -> None:
+    from grr_torch.applications.routes import part_sizes
+    from grr_torch.resolution.report import summary, traded
+
     quality, parts = figures.to_dict(), part_sizes(roadmap)
     if as_json:
         files = {"out": str(out), "record": None if recording is None else str(recording)}
@@ -220,7 +234,7 @@ def build(
         return
     rotation = roadmap.task.to_json().get("rotation")
     turned = "" if rotation is None else f", roll pitch yaw {' '.join(f'{angle:.4g}' for angle in rotation)} rad"
-    title = f"{arm.name}, {roadmap.task.kind} in {roadmap.task.name}{turned}"
+    title = f"{roadmap.robot.name}, {roadmap.task.kind} in {roadmap.task.name}{turned}"
     written = str(out) if recording is None else f"{out}, {recording} (grr-torch view {out})"
     change = summary(roadmap, figures)
     rows = [
@@ -262,14 +276,9 @@ def _seeds(arm: Any, seeds: str | None) -> Any:
         return "auto" if seeds == "auto" else None
     if not Path(seeds).exists() and not Path(seeds).suffix:
         raise ParameterError("--seeds", repr(seeds), "preset, auto, or a .csv, .txt or .npy file")
-    return read_seeds(seeds)
+    return read_seeds(seeds, arm.joint_names)
 
 
 def _bounds(text: str) -> list[tuple[float, float]]:
-    try:
-        values = [float(value) for value in text.replace(",", " ").split()]
-    except ValueError:
-        values = []
-    if len(values) not in (4, 6):
-        raise ParameterError("--bounds", repr(text), "four or six numbers: x0 x1 y0 y1 [z0 z1]")
+    values = some_numbers("--bounds", text, {4, 6}, "four or six numbers, all finite: x0 x1 y0 y1 [z0 z1]")
     return list(zip(values[::2], values[1::2], strict=True))

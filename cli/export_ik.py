@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from grr_torch.cli.options import check_ending
 from grr_torch.cli.show import print_rows, reports_errors
 
 from grr_torch.errors import ParameterError
@@ -27,18 +29,19 @@ def export_ik(
     """
     from grr_torch.learning.neural_ik import load_network
     from grr_torch.learning.onnx import export_onnx, export_torch
-    from grr_torch.output import check_outputs
+    from grr_torch.output import atomic_write, check_outputs
 
     check_outputs({"--onnx": onnx, "--torch": torch_export}, [weights])
-    given = [(name, path) for name, path in ((".onnx", onnx), (".pt2", torch_export)) if path is not None]
+    given = [(export, path) for export, path in ((export_onnx, onnx), (export_torch, torch_export)) if path is not None]
     if not given:
         raise ParameterError("--onnx and --torch", "neither", "at least one of them")
-    for suffix, path in given:
-        if path.suffix.lower() != suffix:
-            raise ParameterError("output", path, f"a file that ends in {suffix}")
+    check_ending("--onnx", onnx, ".onnx")
+    check_ending("--torch", torch_export, ".pt2")
     network, origin = load_network(weights)
     rows = []
-    for suffix, path in given:
-        worst = (export_onnx if suffix == ".onnx" else export_torch)(network, origin, path)
-        rows.append(("written", f"{path}, within {worst:.1e} rad of the network"))
+    # both files appear together, or neither does
+    with ExitStack() as stack:
+        for export, path in given:
+            worst = export(network, origin, stack.enter_context(atomic_write(path)))
+            rows.append(("written", f"{path}, within {worst:.1e} rad of the network"))
     print_rows(f"{origin.robot}: points ({origin.task.width}) to {', '.join(origin.joint_names)}", rows)

@@ -25,6 +25,11 @@ def slopes_cell(quality: Quality) -> str:
     return f"{quality.smoothness_p99:.1f}, {quality.smoothness_max:.1f}; {quality.steep_edges:,}"
 
 
+def share(value: float | None) -> str:
+    """A share in percent; empty where there is none."""
+    return "" if value is None else f"{100.0 * value:.2f} %"
+
+
 def write_figures(file: Path | None, figures: Mapping[str, Any]) -> None:
     """Writes figures as JSON, and what they were measured on, by an atomic rename, if a file is asked for."""
     from grr_torch.experiments.timing import machine

@@ -80,7 +80,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: What follows the program's name; by default what the process was given.
     """
-    app(join_bounds(list(sys.argv[1:] if arguments is None else arguments)), prog_name="grr-torch")
+    app(join_numbers(list(sys.argv[1:] if arguments is None else arguments)), prog_name="grr-torch")
 
 
 # options that take as many numbers as follow, first those of commands that take no file beside options
@@ -90,21 +90,24 @@ _OF_NUMBERS = (*_WITHOUT_FILE, "--point", "--start", "--goal", "--start-configur
 _FILE = re.compile(r"/|\.[A-Za-z]\w*$")
 
 
-def join_bounds(arguments: list[str]) -> list[str]:
+def join_numbers(arguments: list[str]) -> list[str]:
     """Puts the numbers after --bounds, --point and their like into one argument: typer takes a fixed number else.
+
+    The first of them may stand behind an equals sign.
 
     Words that were to be numbers are among them, so that the error names the option.
     """
     joined: list[str] = []
     position = 0
     while position < len(arguments):
-        option = arguments[position]
+        option, equals, first = arguments[position].partition("=")
         position += 1
-        words: list[str] = []
-        if option in _OF_NUMBERS:
+        words = [first] if equals else []
+        if option in _OF_NUMBERS and " " not in first:
             belongs = _is_no_option if option in _WITHOUT_FILE else _is_no_file
-            words = list(itertools.takewhile(belongs, arguments[position:]))
-            position += len(words)
+            more = list(itertools.takewhile(belongs, arguments[position:]))
+            position += len(more)
+            words += more
         joined.append(f"{option}={' '.join(words)}" if words else option)
     return joined
 

@@ -7,7 +7,10 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from grr_torch.cli.show import numbers, print_json, print_rows, reports_errors
+from grr_torch.cli.options import check_ending, numbers
+from grr_torch.cli.show import print_json, print_rows, reports_errors
+
+from grr_torch.errors import ParameterError
 
 if TYPE_CHECKING:
     from grr_torch.applications.path import Path
@@ -51,9 +54,14 @@ def plan(
     from grr_torch.resolution.roadmap import Roadmap
     from grr_torch.tables import check_suffix
 
+    for option, given in (("--start", (start, start_configuration)), ("--goal", (goal, goal_configuration))):
+        if given.count(None) != 1:
+            told = "both" if None not in given else "neither"
+            raise ParameterError(f"{option} and {option}-configuration", told, "one of them")
     if out is not None:
         check_suffix("--out", out)
     check_outputs({"--out": out, "--record": record}, [file])
+    check_ending("--record", record, ".rrd")
     roadmap = Roadmap.load(file)
     axes, joints = roadmap.task.coordinates, roadmap.robot.joint_names
     path = roadmap.plan(

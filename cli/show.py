@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import threading
 import time
 import warnings
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TextIO, TypeVar
 
 import typer
 
-from grr_torch.errors import GrrError, GrrWarning, ParameterError
+from grr_torch.errors import GrrError, GrrWarning
 from grr_torch.progress import Outlook, Plan
 
 if TYPE_CHECKING:
@@ -201,21 +200,6 @@ def bounds_of(roadmap: Roadmap) -> list[list[float]]:
 def bounds_row(roadmap: Roadmap) -> tuple[str, str]:
     """Where the roadmap lies, as --bounds takes it."""
     return "bounds", " ".join(f"{end:.6g}" for side in bounds_of(roadmap) for end in side) + " m"
-
-
-def numbers(option: str, text: str, names: Sequence[str]) -> list[float]:
-    """The numbers that an option takes, one for each name.
-
-    Raises:
-        ParameterError: They are not so many finite numbers.
-    """
-    try:
-        values = [float(value) for value in text.replace(",", " ").split()]
-    except ValueError:
-        values = []
-    if len(values) != len(names) or not all(map(math.isfinite, values)):
-        raise ParameterError(option, repr(text), f"{len(names)} finite numbers: {' '.join(names)}")
-    return values
 
 
 def show_table(head: list[str], rows: list[list[str]]) -> None:

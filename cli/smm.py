@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,20 +20,21 @@ from grr_torch.cli.arm import (
     load_arm,
     read_turning,
 )
-from grr_torch.cli.show import NOT_CHECKED, markdown_table, print_json, progress_bar, reports_errors
+from grr_torch.cli.options import check_ending, check_unused, numbers, some_numbers
+from grr_torch.cli.show import print_json, progress_bar, reports_errors
+from grr_torch.cli.show_self_motion import figures_of, print_manifold, write_manifolds
 
 from grr_torch.errors import ParameterError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from grr_torch.applications.self_motion import SelfMotionManifold
     from grr_torch.resolution.roadmap import Roadmap
     from grr_torch.robots.robot import Robot
     from grr_torch.spaces.task import TaskSpace
 
 # vertices of the roadmap that is built where none is given, few enough that its edges are seen
 _VERTICES = 120
+# numbers of a point, in one task space or another
+_COUNTS = {2, 3, 4, 6, 7}
 
 
 @reports_errors
@@ -59,7 +59,9 @@ def smm(
     ] = None,
     record: Annotated[Path | None, typer.Option(help="Recording to write.", metavar="FILE.rrd")] = None,
     out: Annotated[Path | None, typer.Option(help="Write all samples here.", metavar="FILE.npz")] = None,
-    samples: Annotated[int, typer.Option(help="Random starts, and most samples of what is no curve.")] = 1000,
+    samples: Annotated[
+        int, typer.Option(help="Random starts; of what is no curve, the most samples, half as many starts among them.")
+    ] = 1000,
     step: Annotated[float | None, typer.Option(help="Longest step, in radians; 0.05 on curves, else 0.3.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of all random draws.")] = 0,
     tool: Tool = None,
@@ -78,14 +80,22 @@ def smm(
     Example: grr-torch smm --robot planar_3 --record illustration.rrd
     """
     from grr_torch.applications.self_motion import roadmap_choice, self_motion_manifold
-    from grr_torch.output import atomic_write, check_outputs
-    from grr_torch.recording.self_motion import record_self_motion
+    from grr_torch.output import check_outputs
     from grr_torch.robots.presets import robot_names
 
     check_outputs({"--record": record, "--out": out}, [roadmap, None if robot in robot_names() else robot, spheres])
+    check_ending("--record", record, ".rrd")
+    check_ending("--out", out, ".npz")
+    turning = read_turning(rotation, axis)
     with progress_bar() as progress:
-        given = None
-        if robot is not None:
+        if roadmap is not None:
+            of_arm = {"--tool": tool, "--base": base, "--hold": hold, "--spheres": spheres, "--margin": margin}
+            of_meshes = {"--package-dir": package_dir, "--allow-missing-meshes": allow_missing_meshes}
+            check_unused({**of_arm, **of_meshes}, "--roadmap, as its arm is taken")
+            graph: Roadmap | None = _given_roadmap(roadmap, robot, task, turning)
+        elif robot is None:
+            raise ParameterError("--robot", "nothing", "a bundled robot, the path of a URDF, or --roadmap")
+        else:
             given = load_arm(
                 robot,
                 tool=tool,
@@ -96,62 +106,74 @@ def smm(
                 spheres=spheres,
                 margin=margin,
             )
-        turning = read_turning(rotation, axis)
-        graph = _roadmap(roadmap, given, task, turning, bool(point), progress)
-        places = _triangle(graph) if graph is not None and not point else [_numbers(text) for text in point or []]
-        arm, space = (graph.robot, graph.task) if graph else (given, _task(given, places, task, turning))
-        assert arm is not None
+            graph = None if point else _preset_roadmap(given, task, turning, progress)
+        arm, space = (given, _task(given, point or [], task, turning)) if graph is None else (graph.robot, graph.task)
+        if point:
+            places = [numbers("--point", text, space.coordinates) for text in point]
+        else:
+            assert graph is not None
+            places = _triangle(graph)
         manifolds = [
             self_motion_manifold(arm, space, place, samples=samples, step=step, seed=seed, progress=progress)
             for place in places
         ]
         choices = [None if graph is None else roadmap_choice(graph, manifold.point) for manifold in manifolds]
-        # both files appear together, or neither does
-        with ExitStack() as stack:
-            if record is not None:
-                record_self_motion(manifolds, stack.enter_context(atomic_write(record)), choices, graph)
-            if out is not None:
-                _save(stack.enter_context(atomic_write(out)), manifolds, choices)
+        write_manifolds(manifolds, choices, graph, record, out)
     if as_json:
-        print_json({"robot": arm.name, "task": space.to_json(), "points": [*map(_figures, manifolds, choices)]})
+        print_json({"robot": arm.name, "task": space.to_json(), "points": [*map(figures_of, manifolds, choices)]})
         return
     for manifold, choice in zip(manifolds, choices, strict=True):
-        _print(manifold, choice)
+        print_manifold(manifold, choice)
     written = ", ".join(str(path) for path in (record, out) if path is not None)
     if written:
         typer.echo(f"\nwritten: {written}")
 
 
-def _roadmap(
-    path: Path | None,
-    arm: Robot | None,
-    kind: str | None,
-    turning: dict[str, list[float] | None],
-    has_points: bool,
-    progress: Any,
-) -> Roadmap | None:
-    """The roadmap that is given; where there is neither one nor a point, one of the robot's preset."""
-    from grr_torch.resolution.build import build
+def _given_roadmap(path: Path, robot: str | None, kind: str | None, turning: dict[str, list[float] | None]) -> Roadmap:
+    """The roadmap of a file.
+
+    Raises:
+        ParameterError: It is of another robot or task than is told.
+    """
     from grr_torch.resolution.roadmap import Roadmap
 
-    if path is not None:
-        graph = Roadmap.load(path)
-        if arm is not None and (arm.name, arm.joint_names) != (graph.robot.name, graph.robot.joint_names):
-            raise ParameterError("--robot", arm.name, f"{graph.robot.name}, the roadmap's, or none")
-        if kind not in (None, graph.task.kind):
-            raise ParameterError("--task", kind, f"{graph.task.kind}, the roadmap's, or none")
-        told = graph.task.to_json()
-        for option, values, own in (
-            ("--rotation", turning["rpy"], told.get("rotation")),
-            ("--axis", turning["axis"], told.get("axis")),
-        ):
-            if values not in (None, own):
-                raise ParameterError(option, values, "the roadmap's, or none")
-        return graph
-    if arm is None:
-        raise ParameterError("--robot", "nothing", "a bundled robot, the path of a URDF, or --roadmap")
-    if has_points:
-        return None
+    graph = Roadmap.load(path)
+    if robot is not None and not _is_arm(robot, graph.robot):
+        raise ParameterError("--robot", robot, f"{graph.robot.name}, the roadmap's, or none")
+    if kind not in (None, graph.task.kind):
+        raise ParameterError("--task", kind, f"{graph.task.kind}, the roadmap's, or none")
+    told = graph.task.to_json()
+    for option, values, own in (
+        ("--rotation", turning["rpy"], told.get("rotation")),
+        ("--axis", turning["axis"], told.get("axis")),
+    ):
+        if values not in (None, own):
+            valid = f"none: the roadmap's task, {graph.task.kind}, has none"
+            if own is not None:
+                valid = f"{' '.join(map(str, own))}, the roadmap's, or none"
+            raise ParameterError(option, " ".join(map(str, values or [])), valid)
+    return graph
+
+
+def _is_arm(robot: str, arm: Robot) -> bool:
+    """Whether a bundled name or a URDF is that of an arm, whose tool, base and held joints are not told."""
+    from grr_torch.robots.presets import robot_names
+    from grr_torch.robots.read_urdf import read_urdf
+
+    if robot in robot_names() or not Path(robot).exists():
+        return robot == arm.name
+    urdf = read_urdf(robot)
+    return urdf.name == arm.name and set(arm.joint_names) <= set(urdf.joints)
+
+
+def _preset_roadmap(arm: Robot, kind: str | None, turning: dict[str, list[float] | None], progress: Any) -> Roadmap:
+    """A roadmap of the robot's preset, for a command that names no point.
+
+    Raises:
+        ParameterError: It has none, or something is told that only points need.
+    """
+    from grr_torch.resolution.build import build
+
     if arm.preset is None:
         raise ParameterError("--point", "nothing", f"a point, or --roadmap: {arm.name} has no preset")
     for option, values in (("--rotation", turning["rpy"]), ("--axis", turning["axis"])):
@@ -178,96 +200,15 @@ def _triangle(graph: Roadmap) -> list[list[float]]:
     return triangle
 
 
-def _numbers(text: str) -> list[float]:
-    try:
-        numbers = [float(value) for value in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (2, 3, 4, 6, 7):
-        valid = "two or three numbers, x y [z], and where rotation varies yaw, ax ay az or qw qx qy qz after them"
-        raise ParameterError("--point", repr(text), valid)
-    return numbers
-
-
-def _task(
-    arm: Robot | None, places: list[list[float]], kind: str | None, turning: dict[str, list[float] | None]
-) -> TaskSpace:
+def _task(arm: Robot, points: list[str], kind: str | None, turning: dict[str, list[float] | None]) -> TaskSpace:
     """The task space that the options and the preset say, of as many axes as the points have."""
     from grr_torch.resolution.problem import complete_task
     from grr_torch.spaces.task import Pose
 
-    assert arm is not None
-    # x y yaw is a pose in the plane
-    plane = len(places[0]) == 2 or (len(places[0]) == 3 and kind == Pose.kind)
-    return complete_task(arm, kind, 2 if plane else 3, **turning)
-
-
-def _figures(manifold: SelfMotionManifold, choice: Tensor | None) -> dict[str, Any]:
-    """What is printed of a manifold."""
-    counts = manifold.component.bincount(minlength=manifold.components).tolist()
-    names, ranges = manifold.robot.joint_names, manifold.ranges().tolist()
-    checked = manifold.robot.spheres is not None
-    return {
-        "point": manifold.point.tolist(),
-        "dimension": manifold.dimension,
-        "components": [
-            {
-                "samples": counts[c],
-                "closed": bool(manifold.closed[c]) if manifold.dimension == 1 else None,
-                "free": float(manifold.free[manifold.component == c].double().mean()) if checked else None,
-                "ranges": dict(zip(names, ranges[c], strict=True)),
-            }
-            for c in range(manifold.components)
-        ],
-        "roadmap": None if choice is None else choice.tolist(),
-        "roadmap_component": None if choice is None else manifold.component_of(choice),
-    }
-
-
-def _print(manifold: SelfMotionManifold, choice: Tensor | None) -> None:
-    figures = _figures(manifold, choice)
-    place = ", ".join(f"{value:g}" for value in figures["point"])
-    typer.secho(
-        f"\n{manifold.robot.name}, {manifold.task.kind}, tool at ({place}): dimension {manifold.dimension}", bold=True
+    valid = (
+        "two or three numbers, x y [z], and where rotation varies yaw, ax ay az or qw qx qy qz after them, all finite"
     )
-    rows = [
-        [
-            f"{number + 1}{' *' if number == figures['roadmap_component'] else ''}",
-            f"{part['samples']:,}",
-            {True: "closed", False: "open", None: "no curve"}[part["closed"]],
-            NOT_CHECKED if part["free"] is None else f"{100.0 * part['free']:.1f} %",
-            *(f"{low:.2f} … {high:.2f}" for low, high in part["ranges"].values()),
-        ]
-        for number, part in enumerate(figures["components"])
-    ]
-    head = ["component", "samples", "curve", "free of self-collision", *manifold.robot.joint_names]
-    typer.echo(markdown_table(head, rows))
-    if choice is not None:
-        values = ", ".join(f"{value:.3f}" for value in figures["roadmap"])
-        on = "on no component found" if figures["roadmap_component"] is None else "on the component marked *"
-        typer.echo(f"the roadmap's choice, {on}: {values}")
-
-
-def _save(path: Path, manifolds: list[SelfMotionManifold], choices: list[Tensor | None]) -> None:
-    """All samples as arrays: each with its point, its component (numbered over all points) and whether it is free."""
-    import numpy as np
-    import torch
-
-    firsts = np.cumsum([0, *(manifold.components for manifold in manifolds)])
-    rows = np.cumsum([0, *(len(manifold.configurations) for manifold in manifolds)])
-    nothing = torch.full((manifolds[0].robot.n,), torch.nan)
-    joined = zip(manifolds, firsts, rows, strict=False)
-    parts = [(m.component.numpy() + first, m.edges.numpy() + row) for m, first, row in joined]
-    with path.open("wb") as file:
-        np.savez_compressed(
-            file,
-            joint_names=np.array(manifolds[0].robot.joint_names),
-            points=torch.stack([manifold.point for manifold in manifolds]).numpy(),
-            configurations=torch.cat([manifold.configurations for manifold in manifolds]).numpy(),
-            free=torch.cat([manifold.free for manifold in manifolds]).numpy(),
-            component=np.concatenate([component for component, _ in parts]),
-            edges=np.concatenate([edges for _, edges in parts]),
-            closed=torch.cat([manifold.closed for manifold in manifolds]).numpy(),
-            component_point=np.repeat(np.arange(len(manifolds)), np.diff(firsts)),
-            roadmap=torch.stack([nothing if choice is None else choice for choice in choices]).numpy(),
-        )
+    count, *_ = [len(some_numbers("--point", text, _COUNTS, valid)) for text in points]
+    # x y yaw is a pose in the plane
+    plane = count == 2 or (count == 3 and kind == Pose.kind)
+    return complete_task(arm, kind, 2 if plane else 3, **turning)

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from grr_torch.cli.show import markdown_table, numbers, print_json, print_rows, progress_bar, reports_errors
+from grr_torch.cli.options import numbers
+from grr_torch.cli.show import markdown_table, print_json, print_rows, progress_bar, reports_errors
 
 from grr_torch.errors import ParameterError
 

@@ -8,11 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from grr_torch.cli.options import check_ending, check_unused
 from grr_torch.cli.show import NOT_CHECKED, print_json, print_rows, progress_bar, reports_errors
 
 if TYPE_CHECKING:
     from grr_torch.applications.teleoperate import Teleoperator
     from grr_torch.applications.teleoperation_log import Summary, TeleoperationLog
+
+# where the page is, unless told otherwise
+_HOST, _PORT = "127.0.0.1", 8080
 
 
 @reports_errors
@@ -28,7 +32,7 @@ def teleop(
     ] = None,
     record: Annotated[Path | None, typer.Option(help="Recording to write at the end.", metavar="FILE.rrd")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Write the joint trajectory, unwrapped.", metavar="FILE.csv|.npy|.npz")
+        Path | None, typer.Option(help="Write the joint trajectory, unwrapped.", metavar="FILE.csv|.npy|.npz|.parquet")
     ] = None,
     rate: Annotated[float, typer.Option(help="Control steps in a second.")] = 50.0,
     max_step: Annotated[
@@ -48,9 +52,11 @@ def teleop(
         ),
     ] = 2.0,
     host: Annotated[
-        str, typer.Option(help="Address of the page; by default no other machine can open it.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0: any that is free.")] = 8080,
+        str | None, typer.Option(help=f"Address of the page; {_HOST} by default: no other machine can open it.")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help=f"Port of the page; 0: any that is free; {_PORT} by default.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object at the end.")] = False,
 ) -> None:
     """Teleoperate an arm on its roadmap, in the browser until Ctrl-C, or along a path.
@@ -60,16 +66,22 @@ def teleop(
     Example: grr-torch teleop kinova.grr --path circle --out circle.csv
     """
     from grr_torch.applications.teleoperate import Teleoperator
-    from grr_torch.applications.teleoperation_log import check_trajectory_path
     from grr_torch.output import check_outputs
     from grr_torch.resolution.roadmap import Roadmap
+    from grr_torch.tables import check_suffix
 
+    if path is not None:
+        check_unused({"--host": host, "--port": port}, "--path, as no page is opened")
     if out is not None:
-        check_trajectory_path(out)
+        check_suffix("--out", out)
     check_outputs({"--record": record, "--out": out}, [file, path])
+    check_ending("--record", record, ".rrd")
     roadmap = Roadmap.load(file)
     teleoperator = Teleoperator(roadmap, rate, max_step=max_step, acceleration_limits=acceleration, foresight=foresight)
-    log = _replay(teleoperator, path) if path else _interact(teleoperator, host, port)
+    if path is None:
+        log = _interact(teleoperator, _HOST if host is None else host, _PORT if port is None else port)
+    else:
+        log = _replay(teleoperator, path)
     _write(log, record, out)
     summary = log.summary()
     if as_json:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from grr_torch.cli.options import check_ending
 from grr_torch.cli.show import reports_errors
 
 
@@ -23,6 +24,7 @@ def view(
     from grr_torch.resolution.roadmap import Roadmap
 
     check_outputs({"--save": save}, [file])
+    check_ending("--save", save, ".rrd")
     roadmap = Roadmap.load(file)
     if save is None:
         show_roadmap(roadmap)

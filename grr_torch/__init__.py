@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from grr_torch.robots.robot import Robot
     from grr_torch.robots.spheres import SphereModel
     from grr_torch.spaces.graph import TaskGraph, random_graph, staggered_grid
-    from grr_torch.spaces.task import FixedRotation, Position, TaskSpace
+    from grr_torch.spaces.product import product_graph
+    from grr_torch.spaces.task import FixedRotation, Position, TaskSpace, make_task
+    from grr_torch.spaces.turning import Axis, Pose, Yaw
     from grr_torch.version import __version__
 
 _HOMES = {
@@ -64,19 +66,26 @@ _HOMES = {
     "TaskGraph": "spaces.graph",
     "random_graph": "spaces.graph",
     "staggered_grid": "spaces.graph",
+    "product_graph": "spaces.product",
     "FixedRotation": "spaces.task",
     "Position": "spaces.task",
     "TaskSpace": "spaces.task",
+    "make_task": "spaces.task",
+    "Axis": "spaces.turning",
+    "Pose": "spaces.turning",
+    "Yaw": "spaces.turning",
     "__version__": "version",
 }
 
 __all__ = [
+    "Axis",
     "Command",
     "FixedRotation",
     "GrrError",
     "GrrWarning",
     "NeuralIK",
     "Path",
+    "Pose",
     "Position",
     "Roadmap",
     "RoadmapDataset",
@@ -90,6 +99,7 @@ __all__ = [
     "Teleoperator",
     "Tolerances",
     "TrainingOptions",
+    "Yaw",
     "__version__",
     "build",
     "evaluate_ik",
@@ -98,6 +108,8 @@ __all__ = [
     "is_continuous",
     "load_preset",
     "load_robot",
+    "make_task",
+    "product_graph",
     "project",
     "random_graph",
     "robot_names",

@@ -6,6 +6,7 @@ Every exception keeps these as fields, so that a program can act on them without
 from __future__ import annotations
 
 import difflib
+import operator
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -99,15 +100,36 @@ class ParameterError(GrrError, ValueError):
         super().__init__(f"{name}: got {value}; valid: {valid}")
 
 
+def check_whole(name: str, value: object, low: int, high: int | None = None) -> int:
+    """A whole number as an int; numpy's integers are such, True and False are not.
+
+    Args:
+        name: The parameter, for the error.
+        value: What was given.
+        low: The smallest valid number.
+        high: The largest one; None: there is none.
+
+    Raises:
+        ParameterError: It is no whole number, or out of its range.
+    """
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        number = None
+    if number is None or number < low or (high is not None and number > high):
+        valid = f"a whole number, {low:,} or more" if high is None else f"a whole number from {low:,} to {high:,}"
+        # of a text, "got 100" would not say what is wrong
+        raise ParameterError(name, repr(value) if isinstance(value, str) else value, valid)
+    return number
+
+
 def check_seed(seed: int) -> int:
     """The seed of a random generator.
 
     Raises:
         ParameterError: It is no whole number from 0 to 2⁶³ − 1.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 1 << 63:
-        raise ParameterError("seed", seed, "a whole number from 0 to 2⁶³ − 1")
-    return seed
+    return check_whole("seed", seed, 0, (1 << 63) - 1)
 
 
 class SeedError(GrrError):

@@ -6,24 +6,26 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from csv import reader as csv_rows
+from csv import Error as CsvError
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from grr_torch.errors import FileFormatError, ParameterError
+from grr_torch.errors import FileFormatError, ParameterError, check_whole
 from grr_torch.output import atomic_write
+from grr_torch.table_readers import read_npy, read_parquet, read_text
 
 # rows of a piece
 PIECE = 1 << 14
 AXES = ("x", "y", "z")
 _READS = (".csv", ".npy", ".parquet")
 _WRITES = (".csv", ".npy", ".npz", ".parquet")
-_DELIMITERS = (",", ";", "\t")
 
 Array = npt.NDArray[Any]
+Write = Callable[[dict[str, Array]], None]
 # names of a table's columns by the array that they make up
 Columns = Mapping[str, Sequence[str]]
 
@@ -40,10 +42,7 @@ def check_suffix(name: str, path: Path, *, read: bool = False) -> None:
 
 
 def read_points(path: Path, width: int, axes: Sequence[str] = AXES) -> Iterator[Array]:
-    """Points of a file in pieces (N, width), finite, float64.
-
-    A .csv may have a header. Columns named like the coordinates are taken where there are such; else there must be as
-    many columns as coordinates.
+    """Points of a file in pieces (N, width); see `read_rows`.
 
     Args:
         path: The file.
@@ -52,15 +51,33 @@ def read_points(path: Path, width: int, axes: Sequence[str] = AXES) -> Iterator[
 
     Raises:
         ParameterError: The suffix is not known.
-        FileFormatError: It cannot be read, is not a table of numbers, has the wrong columns, holds NaN, or no point.
+        FileFormatError: As `read_rows` has it.
     """
     check_suffix("points", path, read=True)
+    yield from read_rows(path, axes[:width], "points")
+
+
+def read_rows(path: Path, names: Sequence[str] | None, what: str) -> Iterator[Array]:
+    """Rows of a .npy, a .parquet, or else a text file, in pieces (N, width), finite, float64.
+
+    In a text file, commas, semicolons, tabs or blanks part the values; what follows a # is a comment, and a header may
+    say what the columns are. Of columns that have names, in a header or otherwise, those with the given ones are taken,
+    in whatever order and case; where none is so named, all are, of which there must be as many.
+
+    Args:
+        path: The file.
+        names: Names of the columns that are wanted; None: any number of columns, which have no names.
+        what: What a row is called in errors, in the plural.
+
+    Raises:
+        FileFormatError: It cannot be read, is not a table of numbers, has the wrong columns, holds NaN, or no row.
+    """
     if not path.is_file():
-        raise FileFormatError(path, "is not a regular file" if path.exists() else "is not a file")
-    reader = {".csv": _read_csv, ".npy": _read_npy, ".parquet": _read_parquet}[path.suffix.lower()]
+        raise FileFormatError(path, "is not a regular file" if path.exists() else "does not exist")
+    reader = {".npy": read_npy, ".parquet": read_parquet}.get(path.suffix.lower(), read_text)
     rows = 0
     try:
-        for piece in reader(path, axes[:width]):
+        for piece in reader(path, names):
             bad = np.flatnonzero(~np.isfinite(piece).all(1))
             if len(bad):
                 raise FileFormatError(path, f"row {rows + int(bad[0]) + 1} holds NaN, infinite or missing values")
@@ -68,10 +85,11 @@ def read_points(path: Path, width: int, axes: Sequence[str] = AXES) -> Iterator[
             yield piece
     except OSError as error:
         raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError, MemoryError) as error:
-        raise FileFormatError(path, f"is not a table of numbers: {str(error).splitlines()[0]}") from error
+    except (ValueError, EOFError, MemoryError, CsvError, TokenError, zipfile.BadZipFile) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise FileFormatError(path, f"is not a table of numbers: {reason}") from error
     if rows == 0:
-        raise FileFormatError(path, "holds no points")
+        raise FileFormatError(path, f"holds no {what}")
 
 
 @contextmanager
@@ -83,7 +101,7 @@ def table_writer(
     *,
     metadata: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
-) -> Iterator[Callable[[dict[str, Array]], None]]:
+) -> Iterator[Write]:
     """Gives a function that appends rows to a table, which appears when all are written, or not at all.
 
     A .npy holds a structured array with the columns as fields, a .npz one array for each key of `columns`.
@@ -97,19 +115,46 @@ def table_writer(
         units: Units of columns, for the fields of a .parquet.
 
     Raises:
-        ParameterError: The suffix is not known.
+        ParameterError: The suffix is not known, there are to be no rows, or `count` is not how many were written.
         OutputError: It cannot be written.
     """
     check_suffix("output", path)
+    count = check_whole("rows of a table", count, 1)
     with ExitStack() as stack:
         temporary = stack.enter_context(atomic_write(path))
         suffix = path.suffix.lower()
         if suffix == ".npy":
-            yield stack.enter_context(_write_npy(temporary, columns, count))
+            write = stack.enter_context(_write_npy(temporary, columns, count))
         elif suffix == ".npz":
-            yield stack.enter_context(_write_npz(temporary, count, constants or {}))
+            write = stack.enter_context(_write_npz(temporary, count, constants or {}))
         else:
-            yield stack.enter_context(_write_arrow(temporary, columns, suffix, metadata, units or {}))
+            write = stack.enter_context(_write_arrow(temporary, columns, suffix, metadata, units or {}))
+        yield stack.enter_context(counted(write, count))
+
+
+@contextmanager
+def counted(write: Write, count: int) -> Iterator[Write]:
+    """Gives a function that writes as `write` does, so many rows in all.
+
+    Raises:
+        ParameterError: There are more, or fewer when the block is left, or not equally many in each array.
+    """
+    done = 0
+
+    def write_some(arrays: dict[str, Array]) -> None:
+        nonlocal done
+        lengths = {len(part) for part in arrays.values()}
+        if len(lengths) != 1:
+            raise ParameterError("rows of arrays", sorted(lengths), "equally many in each")
+        rows = lengths.pop()
+        if done + rows > count:
+            raise ParameterError("rows of a table", f"{done + rows:,} or more", f"{count:,}")
+        write(arrays)
+        done += rows
+
+    yield write_some
+    if done != count:
+        raise ParameterError("rows of a table", f"{done:,}", f"{count:,}")
 
 
 def unique_names(joints: Sequence[str], taken: Iterable[str]) -> list[str]:
@@ -117,71 +162,10 @@ def unique_names(joints: Sequence[str], taken: Iterable[str]) -> list[str]:
     return [f"joint {name}" for name in joints] if set(joints) & set(taken) else list(joints)
 
 
-def _wanted(path: Path, names: Sequence[str], axes: Sequence[str]) -> list[str]:
-    """The columns that are a point's coordinates."""
-    if set(axes) <= set(names):
-        return list(axes)
-    if len(names) != len(axes):
-        raise FileFormatError(path, f"has {len(names)} columns; valid: {len(axes)}, or columns named {', '.join(axes)}")
-    return list(names)
-
-
-def _read_csv(path: Path, axes: Sequence[str]) -> Iterator[Array]:
-    from pyarrow import csv, float64
-
-    with path.open(encoding="utf-8-sig") as file:
-        above, first = next(((k, line.strip()) for k, line in enumerate(file) if line.strip()), (0, ""))
-    if not first:
-        return
-    delimiter = next((mark for mark in _DELIMITERS if mark in first), ",")
-    cells = [cell.strip() for cell in next(csv_rows([first], delimiter=delimiter))]
-    header = not all(map(_is_number, cells))
-    names = cells if header else [str(k) for k in range(len(cells))]
-    wanted = _wanted(path, names, axes)
-    reader = csv.open_csv(
-        path,
-        # a header is skipped, so that names are those that were found here
-        read_options=csv.ReadOptions(column_names=names, skip_rows=above + 1 if header else 0, block_size=1 << 20),
-        parse_options=csv.ParseOptions(delimiter=delimiter),
-        convert_options=csv.ConvertOptions(include_columns=wanted, column_types=dict.fromkeys(wanted, float64())),
-    )
-    for batch in reader:
-        yield np.column_stack([column.to_numpy(zero_copy_only=False) for column in batch.columns])
-
-
-def _read_parquet(path: Path, axes: Sequence[str]) -> Iterator[Array]:
-    from pyarrow import parquet, types
-
-    file = parquet.ParquetFile(path)
-    wanted = _wanted(path, file.schema_arrow.names, axes)
-    for name in wanted:
-        kind = file.schema_arrow.field(name).type
-        if not (types.is_floating(kind) or types.is_integer(kind)):
-            raise FileFormatError(path, f"column '{name}' holds {kind}; valid: numbers")
-    for batch in file.iter_batches(PIECE, columns=wanted):
-        columns = [batch.column(name).to_numpy(zero_copy_only=False) for name in wanted]
-        yield np.column_stack(columns).astype(np.float64)
-
-
-def _read_npy(path: Path, axes: Sequence[str]) -> Iterator[Array]:
-    table = np.load(path, mmap_mode="r", allow_pickle=False)
-    names = table.dtype.names
-    wanted = None
-    if names is not None and table.ndim == 1:
-        wanted = _wanted(path, names, axes)
-    elif table.dtype.kind not in "fiu" or table.ndim != 2 or table.shape[1] != len(axes):
-        kind = f"shape {table.shape} of {table.dtype}"
-        raise FileFormatError(path, f"holds an array of {kind}; valid: (N, {len(axes)}), numbers")
-    for start in range(0, len(table), PIECE):
-        piece = table[start : start + PIECE]
-        columns = piece if wanted is None else np.column_stack([piece[name] for name in wanted])
-        yield np.array(columns, dtype=np.float64)
-
-
 @contextmanager
 def _write_arrow(
     path: Path, columns: Columns, suffix: str, metadata: Mapping[str, str] | None, units: Mapping[str, str]
-) -> Iterator[Callable[[dict[str, Array]], None]]:
+) -> Iterator[Write]:
     import pyarrow
     from pyarrow import csv, parquet
 
@@ -197,7 +181,7 @@ def _write_arrow(
             fields = [part.with_metadata({"unit": units[part.name]}) if part.name in units else part for part in fields]
             table = pyarrow.table(parts, schema=pyarrow.schema(fields, metadata=metadata))
             if writer is None:
-                quotes = "needed" if set(',"\r\n') & set("".join(names)) else "none"
+                quotes = "needed" if set(',"\r\n#') & set("".join(names)) else "none"
                 plain = csv.WriteOptions(quoting_style=quotes, quoting_header=quotes)
                 writer = (
                     csv.CSVWriter(path, table.schema, write_options=plain)
@@ -213,7 +197,7 @@ def _write_arrow(
 
 
 @contextmanager
-def _write_npy(path: Path, columns: Columns, count: int) -> Iterator[Callable[[dict[str, Array]], None]]:
+def _write_npy(path: Path, columns: Columns, count: int) -> Iterator[Write]:
     table: Any = None
     done = 0
 
@@ -234,7 +218,7 @@ def _write_npy(path: Path, columns: Columns, count: int) -> Iterator[Callable[[d
 
 
 @contextmanager
-def _write_npz(path: Path, count: int, constants: Mapping[str, Array]) -> Iterator[Callable[[dict[str, Array]], None]]:
+def _write_npz(path: Path, count: int, constants: Mapping[str, Array]) -> Iterator[Write]:
     """Arrays grow on the disk beside the file, and are put into it at the end."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f"{path.name}.") as folder, ExitStack() as stack:
         files: dict[str, Any] = {}
@@ -266,11 +250,3 @@ def _parts(array: Array) -> list[Array]:
 def _stored(array: Array) -> np.dtype[Any]:
     """The type that holds later pieces too: texts may be longer there."""
     return np.dtype("<U16") if array.dtype.kind == "U" else array.dtype
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return text == ""
-    return True

@@ -5,21 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from grr_torch.errors import FileFormatError
 from grr_torch.output import atomic_write
-
-Array = npt.NDArray[Any]
+from grr_torch.tables import Array, Write, counted
 
 _NAMES = {
     torch.float64: "F64",
@@ -98,7 +96,7 @@ def read_tensors(path: str | os.PathLike[str], what: str) -> tuple[dict[str, str
         FileFormatError: It is missing, truncated or no such file.
     """
     if not Path(path).is_file():
-        raise FileFormatError(path, "is not a file")
+        raise FileFormatError(path, "is not a regular file" if Path(path).exists() else "does not exist")
     try:
         with safe_open(path, framework="pt") as file:
             names = list(file.keys())
@@ -134,7 +132,7 @@ def _pieces(tensor: Tensor) -> Iterator[memoryview]:
 
 
 @contextmanager
-def stream_tensors(path: Path, count: int, metadata: Mapping[str, str]) -> Iterator[Callable[[dict[str, Array]], None]]:
+def stream_tensors(path: Path, count: int, metadata: Mapping[str, str]) -> Iterator[Write]:
     """Gives a function that appends rows to the tensors of a safetensors file.
 
     The format is a header's length in 8 bytes, the header in JSON, and the tensors one after the other; as the number
@@ -144,6 +142,9 @@ def stream_tensors(path: Path, count: int, metadata: Mapping[str, str]) -> Itera
         path: The file.
         count: How many rows there will be.
         metadata: Of the file.
+
+    Raises:
+        ParameterError: `count` is not how many were written.
     """
     starts: dict[str, int] = {}
     done = 0
@@ -160,7 +161,8 @@ def stream_tensors(path: Path, count: int, metadata: Mapping[str, str]) -> Itera
                 file.write(np.ascontiguousarray(rows).data)
             done += len(next(iter(arrays.values())))
 
-        yield write
+        with counted(write, count) as write_counted:
+            yield write_counted
 
 
 def _lay_out(count: int, metadata: Mapping[str, str], arrays: Mapping[str, Array]) -> tuple[bytes, dict[str, int]]:

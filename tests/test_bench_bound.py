@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
+import weakref
 
 import pytest
 import torch
 
 import grr_torch
 from grr_torch.errors import ParameterError
+from grr_torch.experiments import bound
 from grr_torch.experiments.bound import bound_without, mean_without, measure_bound
 from grr_torch.experiments.labelling import Graph, Search
 from grr_torch.resolution.refine import refine
@@ -112,6 +114,21 @@ def test_the_more_edges_are_left_out_the_lower_is_the_bound(plain):
     assert len(set(bounds)) == 3
     assert all(result.bound <= result.best * (1.0 + 1e-6) for result in results)
     assert all(result.best <= result.smoothness for result in results)
+
+
+def test_one_search_s_tables_are_gone_before_the_next_are_made(plain, monkeypatch):
+    made = []
+
+    def tables(*arguments):
+        assert all(table() is None for table in made), "two at once would not fit the memory that one was checked for"
+        found = original(*arguments)
+        made.append(weakref.ref(found))
+        return found
+
+    original = bound._tables
+    monkeypatch.setattr(bound, "_tables", tables)
+    measure_bound(plain, samples=10, iterations=2, left_out=(0, 3, 10))
+    assert len(made) == 3
 
 
 @pytest.mark.parametrize(

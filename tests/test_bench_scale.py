@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 
 import pytest
 from grr_torch.cli.main import app
 from typer.testing import CliRunner
 
+from grr_torch import build
 from grr_torch.errors import ParameterError
+from grr_torch.experiments import scale
 from grr_torch.experiments.scale import Size, exponents, measure_scale, plot
 from grr_torch.experiments.timing import in_fresh_process
 
@@ -45,6 +50,30 @@ def test_the_command_measures_prints_and_draws(tmp_path):
     assert all(value > 0.0 for value in figures.values())
     assert figures["peak_mib"] > 50.0 > figures["file_mib"]
     assert picture.stat().st_size > 1000
+
+
+def test_processor_time_is_that_of_forked_processes_too():
+    before, alone = scale._processor_seconds(), time.process_time()
+    burn = "import time\nwhile time.process_time() < 0.5: pass"
+    subprocess.run([sys.executable, "-c", burn], check=True)
+    assert scale._processor_seconds() - before >= 0.5 > time.process_time() - alone
+
+
+@pytest.mark.parametrize("task", ["position", "pose"])
+def test_the_build_that_warms_up_is_small_beside_what_is_measured(monkeypatch, task):
+    sizes = []
+
+    def noted(*arguments, **options):
+        roadmap = build(*arguments, **options)
+        sizes.append(len(roadmap.points))
+        return roadmap
+
+    monkeypatch.setattr(scale, "build", noted)
+    figures = scale._grow("kinova", task, 400, False, "cpu")
+    warm, measured = sizes
+    assert measured == figures["vertices"]
+    assert 1.5 * warm < measured
+    assert figures["cpu_seconds"] > 0.0
 
 
 def refuse():

@@ -32,6 +32,26 @@ def test_paths_are_what_their_names_say(planar_roadmap, kind):
         assert torch.allclose(paths[:, 0], -paths[:, -1])
 
 
+def test_no_two_kinds_and_seeds_share_a_draw(planar_roadmap, monkeypatch):
+    seen = []
+
+    def circles(roadmap, kind, waypoints, generator):
+        seen.append(generator.initial_seed())
+        return torch.zeros(1, waypoints, 2)
+
+    def ends(roadmap, kind, generator):
+        return circles(roadmap, kind, 2, generator).unbind(1)
+
+    monkeypatch.setattr("grr_torch.experiments.paths._circles", circles)
+    monkeypatch.setattr("grr_torch.experiments.paths._ends", ends)
+    for seed in (0, 1, 2, 3, 4, 2**63 - 1):
+        for kind in KINDS:
+            draw_paths(planar_roadmap, kind, 1, seed=seed)
+    assert len(set(seen)) == len(seen)
+    # the paths of the README
+    assert seen[:4] == [0, 1, 2, 3]
+
+
 def test_a_trajectory_on_its_path_has_no_deviation_and_one_beside_it_has(planar_roadmap):
     robot = planar_roadmap.robot
     q = torch.linspace(0.2, 0.8, 30, dtype=torch.float64)[:, None] * torch.ones(5, dtype=torch.float64)
@@ -90,7 +110,7 @@ def _npz(path, **arrays):
 
 
 def test_bad_files_of_paths_are_refused(tmp_path):
-    with pytest.raises(FileFormatError, match="is not a file"):
+    with pytest.raises(FileFormatError, match="does not exist"):
         read_paths(tmp_path / "none.npz", 3)
     (tmp_path / "empty.npz").touch()
     with pytest.raises(FileFormatError, match="cannot be read"):
@@ -137,10 +157,10 @@ def test_the_command_prints_a_table_and_json_and_writes_trajectories(planar_road
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["none.grr"], "is not a file"),
+        (["none.grr"], "does not exist"),
         (["MAP", "--methods", "newtn"], "Did you mean 'newton'"),
         (["MAP", "--methods", ","], "--methods"),
-        (["MAP", "--paths", "none.npz"], "is not a file"),
+        (["MAP", "--paths", "none.npz"], "does not exist"),
         (["MAP", "--out", "here.csv"], ".npz"),
         (["MAP", "--out", "no/folder/x.npz"], "does not exist"),
     ],

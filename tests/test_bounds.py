@@ -9,8 +9,9 @@ import torch
 
 import grr_torch
 from grr_torch.errors import GrrWarning, ParameterError
+from grr_torch.projection.project import tool_points
 from grr_torch.resolution.problem import pose_problem
-from grr_torch.resolution.reachability import reach, reach_box
+from grr_torch.resolution.reachability import reach, reach_box, within_reach
 
 
 def chain(path, *joints):
@@ -111,3 +112,22 @@ def test_bounds_that_leave_z_free_are_warned_of(kinova, flat_arm, tmp_path):
         pose_problem(kinova, grr_torch.Position(3), bounds=[*sides, (0.2, 0.6)])
         graph = grr_torch.staggered_grid(sides, 20)
         pose_problem(kinova, grr_torch.Position(2), points=graph)
+
+
+def test_a_tool_that_points_down_reaches_the_same_poses(tmp_path):
+    """Of planar arms whose tool is mounted aside, so that the wrist lies aside of it too."""
+    arms = []
+    for name, rpy in (("up", "0 0 0"), ("down", "3.141592653589793 0 0")):
+        chain(tmp_path / "arm.urdf", TURN, TURN, TURN, TURN)
+        head, end, _ = (tmp_path / "arm.urdf").read_text().partition('<origin xyz="0.1 0 0"/></joint></robot>')
+        assert end
+        (tmp_path / f"{name}.urdf").write_text(f'{head}<origin xyz="0 0.2 0" rpy="{rpy}"/></joint></robot>')
+        arms.append(grr_torch.load_robot(tmp_path / f"{name}.urdf"))
+    task = grr_torch.Pose(2)
+    for arm in arms:
+        q = arm.sample(2000, torch.Generator().manual_seed(0))
+        assert bool(within_reach(arm, task, tool_points(arm, task, q)).all())
+    points = torch.rand(2000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5
+    inside = [within_reach(arm, task, points * torch.tensor([1.6, 1.6, 6.0])) for arm in arms]
+    assert 0.1 < float(inside[1].double().mean()) < 0.9
+    assert abs(int(inside[0].sum()) - int(inside[1].sum())) < 100

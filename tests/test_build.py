@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small_urdfs import hinge, robot_text
 
 import grr_torch
 from grr_torch.errors import GrrWarning, ParameterError, SeedError, UnknownNameError
@@ -17,7 +18,7 @@ from grr_torch.resolution.expand import expand
 from grr_torch.resolution.reachability import reach
 from grr_torch.resolution.seeds import read_seeds
 from grr_torch.spaces.configuration import average, distance, embed
-from grr_torch.spaces.graph import TaskGraph
+from grr_torch.spaces.graph import TaskGraph, staggered_grid
 
 # reachable vertices and edges between them, as the arm's own shapes allow
 PROBLEMS = [
@@ -211,10 +212,26 @@ def test_seed_files_are_read(tmp_path):
             "stays in a plane",
         ),
         ({"task": grr_torch.FixedRotation(2), "bounds": [(-1, 1), (-1, 1)]}, "tool leaves the plane"),
+        (
+            {"task": grr_torch.FixedRotation(2), "points": 9, "robot": "two", "bounds": [(0, 0.2)] * 2},
+            "which fixes 3 coordinates; valid: one that fixes no more than r has joints, 2",
+        ),
+        ({"reachability": 1.5}, "reachability: got 1.5"),
+        ({"neighbours": 2.5}, "neighbours: got 2.5"),
+        ({"samples": 1.5, "method": "random"}, "samples: got 1.5"),
+        ({"samples": 9}, 'samples: got 9; valid: none with method "expansion"'),
+        ({"neighbours": 9, "method": "random"}, "neighbours: got 9"),
+        ({"candidates": 9, "method": "random"}, "candidates: got 9"),
+        ({"candidates": 9}, "candidates: got 9; valid: none with seeds that are given"),
+        ({"points": staggered_grid([(0, 0.5)] * 3, 20), "bounds": [(0, 1)] * 3}, "bounds: got .*its own bounds"),
     ],
 )
-def test_bad_parameters_are_errors(kinova, options, complaint):
+def test_bad_parameters_are_errors(kinova, options, complaint, tmp_path):
     task, name = options.pop("task", "position"), options.pop("robot", None)
+    if name == "two":
+        parts = [hinge(f"j{k}", f"l{k}", f"l{k + 1}") for k in range(2)]
+        (tmp_path / "two.urdf").write_text(robot_text(*parts, links=("l0", "l1", "l2")))
+        name = tmp_path / "two.urdf"
     robot = grr_torch.load_robot(name) if name else kinova
     with pytest.raises(ParameterError, match=complaint):
         grr_torch.build(robot, task, **options)

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 from command_line import run
-from grr_torch.cli.main import join_bounds
+from grr_torch.cli.main import join_numbers
 
 import grr_torch
 
@@ -168,18 +168,25 @@ def test_help_imports_nothing_heavy(tmp_path):
 
 
 def test_the_numbers_after_bounds_become_one_argument(tmp_path, monkeypatch):
-    assert join_bounds(["build", "--bounds", "-1", "1", "-2e-1", ".5", "--points", "3"]) == [
+    assert join_numbers(["build", "--bounds", "-1", "1", "-2e-1", ".5", "--points", "3"]) == [
         "build", "--bounds=-1 1 -2e-1 .5", "--points", "3",
     ]  # fmt: skip
-    assert join_bounds(["--start", "0", "-1", "--goal", "2", "3", "--smooth"]) == [
+    assert join_numbers(["--start", "0", "-1", "--goal", "2", "3", "--smooth"]) == [
         "--start=0 -1",
         "--goal=2 3",
         "--smooth",
     ]
-    assert join_bounds(["--bounds", "-1 1 0 2"]) == ["--bounds", "-1 1 0 2"]
-    assert join_bounds(["solve", "--point", "0.1", ""]) == ["solve", "--point=0.1 "]
+    assert join_numbers(["--bounds", "-1 1 0 2"]) == ["--bounds", "-1 1 0 2"]
+    assert join_numbers(["solve", "--point", "0.1", ""]) == ["solve", "--point=0.1 "]
+    assert join_numbers(["--point=0.4", "0.2", "-.3", "r.grr"]) == ["--point=0.4 0.2 -.3", "r.grr"]
+    assert join_numbers(["--bounds=-1 1 0 2", "--hold", "a=1", "--rotation=0", "1", "2"]) == [
+        "--bounds=-1 1 0 2",
+        "--hold",
+        "a=1",
+        "--rotation=0 1 2",
+    ]
     # a map may have any name, once it is there
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rr").touch()
     words = ["--start", "0.3", "0", "--goal", "0", "0.3", "rr", "--out", "p.csv"]
-    assert join_bounds(words) == ["--start=0.3 0", "--goal=0 0.3", "rr", "--out", "p.csv"]
+    assert join_numbers(words) == ["--start=0.3 0", "--goal=0 0.3", "rr", "--out", "p.csv"]

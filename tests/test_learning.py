@@ -193,7 +193,7 @@ def test_damaged_weights_are_refused(planar_roadmap, trained, tmp_path):
     planar_roadmap.save(path)
     with pytest.raises(FileFormatError, match="not a file of neural IK weights"):
         NeuralIK.load(path, planar_roadmap)
-    with pytest.raises(FileFormatError, match="is not a file"):
+    with pytest.raises(FileFormatError, match="does not exist"):
         NeuralIK.load(tmp_path / "none.safetensors", planar_roadmap)
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from grr_torch import NeuralIK
-from grr_torch.errors import ParameterError
+from grr_torch.errors import GrrError, ParameterError
 from grr_torch.experiments.learning import compare_warm_starts
 from grr_torch.learning.checkpoint import checkpoint_path
 from grr_torch.learning.split import SPLITS
@@ -87,6 +87,27 @@ def test_interrupted_training_says_how_to_go_on(command, tmp_path, monkeypatch):
     code, _, err = command("train-ik", "r.grr", "--out", "new.safetensors", "--resume", *size)
     assert code == 0
     assert "epoch 1/2" not in err
+
+
+@pytest.mark.parametrize("what_ends_it", [KeyboardInterrupt, GrrError("no more")])
+def test_networks_are_exported_in_all_formats_or_none(command, tmp_path, monkeypatch, what_ends_it):
+    def write(network, origin, path):
+        path.write_text("written")
+        return 0.0
+
+    def stop(network, origin, path):
+        path.write_text("half")
+        raise what_ends_it
+
+    monkeypatch.setattr("grr_torch.learning.onnx.export_onnx", write)
+    monkeypatch.setattr("grr_torch.learning.onnx.export_torch", stop)
+    before = set(tmp_path.iterdir())
+    code, _, err = command("export-ik", "ik.safetensors", "--onnx", "x.onnx", "--torch", "x.pt2")
+    assert (code, err) in ((130, "interrupted: nothing was written\n"), (2, "error: no more\n"))
+    assert set(tmp_path.iterdir()) == before
+    monkeypatch.setattr("grr_torch.learning.onnx.export_torch", write)
+    assert command("export-ik", "ik.safetensors", "--onnx", "x.onnx", "--torch", "x.pt2")[0] == 0
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in before} | {"x.onnx", "x.pt2"}
 
 
 @pytest.mark.parametrize(

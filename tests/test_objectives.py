@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from grr_torch.errors import FileFormatError, ParameterError, UnknownNameError
 from grr_torch.experiments.trade import measure_trade
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.edges import check_edges
-from grr_torch.resolution.objectives import OBJECTIVES, Objective, measure_objective
+from grr_torch.resolution.objectives import OBJECTIVES, Objective, check_objectives, measure_objective
 from grr_torch.resolution.refine import refine
 from grr_torch.resolution.report import check_refinement, traded
 
@@ -45,6 +46,26 @@ def test_an_objective_gains_at_the_price_of_smoothness(plain, smooth, name):
         "before": {"mean": pytest.approx(float(before.mean())), "worst": pytest.approx(float(before.min()))},
         "after": {"mean": pytest.approx(float(after.mean())), "worst": pytest.approx(float(after.min()))},
     }
+
+
+def test_a_joint_without_room_has_no_part_in_limits(plain):
+    robot = plain.robot
+    still = robot.lower.clone(), robot.upper.clone()
+    still[0][1] = still[1][1] = 0.2
+    fixed = replace(robot, lower=still[0], upper=still[1])
+    q = fixed.sample(50, torch.Generator().manual_seed(0))
+    values = measure_objective(fixed, plain.task, "limits", q)
+    assert bool(values.isfinite().all())
+    limited = robot.lower.isfinite() & ~robot.continuous
+    limited[1] = False
+    share = 1.0 - (2.0 * q - robot.lower - robot.upper).abs() / (robot.upper - robot.lower)
+    assert torch.allclose(values, share[:, limited].amin(1))
+
+
+def test_checking_draws_nothing(kinova):
+    before = torch.random.get_rng_state()
+    check_objectives(kinova, {"clearance": 1.0, "limits": 0.5})
+    assert torch.equal(torch.random.get_rng_state(), before)
 
 
 def test_nothing_is_lost_for_objectives(plain, smooth):

@@ -105,7 +105,14 @@ def test_between_vertices_no_route_is_shorter(roadmap):
 def test_every_connected_edge_can_be_followed(roadmap):
     planner = Planner(roadmap)
     first, second = (planner._vertices(ends) for ends in roadmap.edges[roadmap.connected].T)
-    assert all(way is not None for way in planner.ways.on_lines(first, second))
+    ways = planner.ways.on_lines(first, second)
+    missing = torch.tensor([way is None for way in ways]).nonzero()[:, 0]
+    # one in a thousand may graze the arm between the waypoints that the check of edges looked at
+    assert len(missing) <= 1e-3 * len(ways)
+    deeper = replace(roadmap, robot=replace(roadmap.robot, margin=roadmap.robot.margin - 1e-3))
+    again = Planner(deeper)
+    ends = (again._vertices(ends[missing]) for ends in roadmap.edges[roadmap.connected].T)
+    assert all(way is not None for way in again.ways.on_lines(*ends))
 
 
 def test_where_the_averages_do_not_follow_the_edges_paths_do(roadmap):
@@ -140,6 +147,7 @@ def test_the_deviation_is_that_of_the_tool_from_its_straight_lines(roadmap):
     apart = (position[:, None] - corners[:-1] - share.clamp(0.0, 1.0)[..., None] * line).norm(dim=2).amin(1)
     # at a corner, the line after it may be nearer by part of a projection's tolerance
     assert path.max_deviation == pytest.approx(apart.max().item(), rel=0.05, abs=2e-5)
+    assert path.mean_deviation == pytest.approx(apart.mean().item(), rel=0.02)
     coarse = roadmap.plan(start, goal, step=0.1)
     assert_is_a_path(roadmap, coarse, step=0.1)
     assert len(coarse.times) < len(path.times)
@@ -263,7 +271,7 @@ def test_bad_input_is_refused(roadmap):
     (point,) = solved_points(roadmap, 1, seed=16)
     q = roadmap.solve(point).configurations
     for arguments, complaint in [
-        ({"start": point}, "goal: got neither of a point and a configuration"),
+        ({"start": point}, "goal: got neither of a point and a configuration; valid: goal or goal_configuration"),
         ({"goal": point}, "start: got neither"),
         ({"start": point, "start_configuration": q, "goal": point}, "start: got both"),
         ({"start": point[:-1], "goal": point}, "point shape"),

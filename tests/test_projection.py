@@ -114,6 +114,20 @@ def test_what_is_valid_is_there_and_within_limits_on_random_robots(tmp_path_fact
     assert bool((left <= 1e-4).all())
 
 
+@pytest.mark.parametrize("together", [2, 7, 300, 1000])
+def test_what_else_is_projected_changes_nothing(kinova, generator, together):
+    """From far off, many steps meet limits; by arrays of a few at a time, and pieces of many."""
+    points = kinova.forward_kinematics(kinova.sample(1000, generator))[0]
+    guesses = kinova.sample(1000, generator)
+    whole, valid = project(kinova, Position(3), points, guesses)
+    pairs = zip(points.split(together), guesses.split(together), strict=True)
+    parts = [project(kinova, Position(3), *pair) for pair in pairs]
+    assert torch.equal(torch.cat([part[1] for part in parts]), valid)
+    apart = distance(torch.cat([part[0] for part in parts])[valid], whole[valid], kinova.continuous)
+    # but for the last digits, which Newton's method brings back where it converges
+    assert float(apart.max()) < 1e-6
+
+
 @pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2), (0,)])
 def test_batch_axes_lead(planar_5, generator, batch):
     guesses = planar_5.sample(math.prod(batch), generator).reshape(*batch, 5)

@@ -252,8 +252,10 @@ def test_what_is_written_is_what_the_library_reads(tmp_path, generator, shape, d
 
 
 def test_a_missing_file_is_a_clear_error(tmp_path):
-    with pytest.raises(FileFormatError, match="is not a file"):
+    with pytest.raises(FileFormatError, match="none.grr: does not exist"):
         grr_torch.Roadmap.load(tmp_path / "none.grr")
+    with pytest.raises(FileFormatError, match="is not a regular file"):
+        grr_torch.Roadmap.load(tmp_path)
 
 
 def test_networkx_gets_the_resolved_part(planar_roadmap):

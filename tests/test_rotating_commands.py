@@ -7,14 +7,14 @@ import json
 
 import numpy as np
 import pytest
-from grr_torch.cli.main import app, join_bounds
+from grr_torch.cli.main import app, join_numbers
 from typer.testing import CliRunner
 
 import grr_torch
 
 
 def run(*words: object) -> tuple[int, str]:
-    result = CliRunner().invoke(app, join_bounds([str(word) for word in words]))
+    result = CliRunner().invoke(app, join_numbers([str(word) for word in words]))
     return result.exit_code, result.output
 
 

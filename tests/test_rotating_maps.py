@@ -90,7 +90,7 @@ def test_what_cannot_be_reached_is_said_so(planar_pose):
 
 def test_every_resolved_vertex_is_solved_at_its_own_point(kinova):
     """On a coarse map with many broken edges, in which some vertices lie in the smaller part of what is around them."""
-    roadmap = grr_torch.build(kinova, "axis", points=150, rotations=12, candidates=2, refine=False)
+    roadmap = grr_torch.build(kinova, "axis", points=150, rotations=12, refine=False)
     points = roadmap.points[roadmap.resolved]
     solution = roadmap.solve(points)
     assert bool(solution.valid.all())

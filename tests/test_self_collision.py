@@ -219,6 +219,33 @@ def test_a_model_survives_its_file(kinova, tmp_path):
     assert SphereModel.parse(tiny.to_yaml(), ["a", "b"], source="tiny") == tiny
 
 
+def test_names_that_yaml_takes_for_something_else_survive():
+    names = ["on", "No", "y", "null", "True", "~", "1e5", "0x1F", "1_0", "é", "a: b", "a#b", 'a"b', "a\\b", "a\tb", "-"]
+    spheres = {name: (Sphere((0.0, 0.0, 1.0), 0.5),) for name in names}
+    model = SphereModel(spheres, frozenset(itertools.pairwise(names)))
+    assert SphereModel.parse(model.to_yaml(), names, source="text") == model
+
+
+def test_a_pair_is_ignored_in_whatever_order():
+    spheres = {name: (Sphere((0.0, 0.0, 0.0), 1.0),) for name in "abc"}
+    model = SphereModel(spheres, frozenset({("b", "a"), ("b", "c")}))
+    assert model.checked == [("a", "c")]
+    assert model.ignored == {("a", "b"), ("b", "c")}
+    for wrong in ("ab", ("a",), ("a", "b", "c")):
+        with pytest.raises(ParameterError, match="ignored: .* valid: pairs of links"):
+            SphereModel(spheres, frozenset({wrong}))
+
+
+def test_a_model_names_links_of_its_robot(box_arm):
+    spheres = {name: (Sphere((0.0, 0.0, 0.0), 0.1),) for name in ("base", "hand")}
+    for model in (
+        SphereModel({**spheres, "hnad": spheres["hand"]}, frozenset()),
+        SphereModel(spheres, frozenset({("base", "hnad")})),
+    ):
+        with pytest.raises(UnknownNameError, match=r"unknown link 'hnad'. Did you mean 'hand'\?"):
+            grr_torch.load_robot(box_arm, spheres=model)
+
+
 def test_curobo_s_nesting_and_disabled_spheres_are_read():
     text = """robot_cfg:
   kinematics:

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from grr_torch.cli.main import app, join_bounds
+from grr_torch.cli.main import app, join_numbers
 from test_cli import run
 from typer.testing import CliRunner
 
@@ -286,7 +286,7 @@ def test_the_command_prints_writes_and_refuses(tmp_path):
     assert arrays["configurations"].shape == (count, 3)
     assert arrays["component"].max() + 1 == len(arrays["closed"]) == len(arrays["component_point"])
     table = CliRunner().invoke(
-        app, join_bounds(["smm", "--robot", "planar_5", "--point", "0.2", "-0.1", "--samples", "50"])
+        app, join_numbers(["smm", "--robot", "planar_5", "--point", "0.2", "-0.1", "--samples", "50"])
     )
     assert table.exit_code == 0, table.output
     assert "no curve" in table.output
@@ -297,5 +297,5 @@ def test_the_command_prints_writes_and_refuses(tmp_path):
         (("--point", 0.1, 0.1), "--robot"),
         (("--robot", "planar_3", "--task", "fixed-rotation"), "Known: position"),
     ):
-        refused = CliRunner().invoke(app, join_bounds(["smm", *map(str, words)]))
+        refused = CliRunner().invoke(app, join_numbers(["smm", *map(str, words)]))
         assert (refused.exit_code, message in refused.output) == (2, True), refused.output

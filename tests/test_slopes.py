@@ -10,7 +10,10 @@ import torch
 
 import grr_torch
 from grr_torch.errors import FileFormatError, GrrWarning, ParameterError
+from grr_torch.progress import silent
 from grr_torch.projection.project import Tolerances
+from grr_torch.resolution import quality, report
+from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.options import bounded
 from grr_torch.resolution.problem import pose_problem
 from grr_torch.resolution.refine import refine
@@ -232,3 +235,13 @@ def test_a_bound_that_leaves_most_edges_out_is_warned_of(planar_5):
         roadmap = grr_torch.build(planar_5, "position", points=100, refine=False, max_slope=0.01)
     assert not roadmap.connected.any()
     assert roadmap.resolved.any()
+
+
+def test_more_edges_than_torch_sorts_have_figures(planar_roadmap, monkeypatch):
+    slopes = torch.linspace(0.0, 100.0, (1 << 24) + 1, dtype=torch.float64)
+    for module in (quality, report):
+        monkeypatch.setattr(module, "edge_slopes", lambda roadmap: slopes)
+    figures = quality.measure_quality(planar_roadmap)
+    assert (figures.smoothness_p99, figures.smoothness_max) == (pytest.approx(99.0), 100.0)
+    told = report.before_refinement(planar_roadmap, silent, Checkpoint())
+    assert told["smoothness_p99"] == pytest.approx(99.0)

@@ -199,6 +199,27 @@ def test_points_in_uncertified_cells_say_so(kinova_roadmap):
     assert share > 0.9
 
 
+def test_points_whose_cell_lacks_a_corner_are_uncertified(roadmap):
+    """As the differentiable map has it, but where what it knows of parts counts."""
+    missing = int(roadmap.resolved.nonzero()[len(roadmap.resolved.nonzero()) // 2])
+    resolved = roadmap.resolved.clone()
+    resolved[missing] = False
+    broken = roadmap.connected & (roadmap.edges != missing).all(1)
+    q = roadmap.configurations.clone()
+    q[missing] = torch.nan
+    without = dataclasses.replace(roadmap, resolved=resolved, configurations=q, connected=broken)
+    ends = roadmap.edges[roadmap.connected & (roadmap.edges == missing).any(1)]
+    beside = roadmap.points[ends].mean(1)
+    before, after = roadmap.solve(beside), without.solve(beside)
+    both = (before.valid & after.valid).numpy()
+    assert both.sum() >= 2
+    assert "solved" in before.status[both]
+    assert set(after.status[both]) == {"uncertified"}
+    far = (roadmap.points - roadmap.points[missing]).norm(dim=1) > 2.0 * roadmap.longest_edge
+    vertices = roadmap.points[far & resolved]
+    assert np.array_equal(roadmap.solve(vertices).status, without.solve(vertices).status)
+
+
 def test_points_beside_a_broken_edge_are_uncertified(roadmap):
     """So are they in all that would be cells, were the edge not broken; far from it nothing changes."""
     corners = roadmap.cells()[0].corners

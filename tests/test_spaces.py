@@ -144,6 +144,9 @@ def test_tasks_survive_json():
         ("position", 4, None),
         ("position", 3, (0, 0, 0)),
         ("fixed-rotation", 3, (0, 0)),
+        ("fixed-rotation", 3, ()),
+        ("fixed-rotation", 3, 0.0),
+        ("fixed-rotation", 3, ("a", "b", "c")),
         ("fixed-rotation", 3, (0, 0, math.nan)),
         ("fixed-rotation", 3, (180.0, 0, 90.0)),
         ("fixed-rotation", 2, (1.0, 0, 0)),
@@ -249,6 +252,7 @@ def test_adjacency_lists_both_directions():
         (torch.eye(2, dtype=torch.float64), torch.tensor([0, 1])),
         (torch.eye(2, dtype=torch.float64), torch.tensor([[1, 1]])),
         (torch.eye(2, dtype=torch.float64), torch.tensor([[1, 0]])),
+        (torch.eye(3, dtype=torch.float64), torch.tensor([[0, 1], [1, 2], [0, 1]])),
     ],
 )
 def test_a_bad_graph_is_an_error(points, edges):
@@ -274,7 +278,7 @@ def test_bad_bounds_are_errors(bounds):
         staggered_grid(bounds, 100)
 
 
-@pytest.mark.parametrize("n", [0, -5, 10**12, True, 2.5])
+@pytest.mark.parametrize("n", [0, -5, 10**12, True, 2.5, "100"])
 def test_bad_counts_are_errors(n):
     with pytest.raises(ParameterError, match="points: got"):
         staggered_grid([(0, 1), (0, 1)], n)

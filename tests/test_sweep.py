@@ -109,7 +109,7 @@ def test_files_count_by_what_is_in_them(tmp_path):
         ("builds: [{robot: planar_5, seeds: [[0, 0]]}]", "seeds have shape (1, 2)"),
         ("builds: [{robot: planar_5, task: rotate}]", "Did you mean 'fixed-rotation'?"),
         ("builds: [{robot: planar_5, task: position, rotation: [0, 0, 1]}]", "none for the task 'position'"),
-        ("builds: [{robot: planar_5, seeds: none.csv}]", "none.csv: cannot be read"),
+        ("builds: [{robot: planar_5, seeds: none.csv}]", "none.csv: does not exist"),
         ("builds: [{robot: planar_5}, {robot: planar_5, seed: 0}]", "build 2 and build 1 are the same roadmap"),
         ("defaults: {robot: planar_5}\ngrid: {seed: [0, 1, 0]}", "grid (seed: 0) and grid (seed: 0) are the same"),
         ("builds: [{robot: planar_5}, {robot: planar_5, needs: {cpus: 2}}]", "contradict each other"),

@@ -48,7 +48,7 @@ def test_the_commands_say_what_they_did(tmp_path):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ("sweep none.yaml", "none.yaml: is not a file"),
+        ("sweep none.yaml", "none.yaml: does not exist"),
         ("sweep s.yaml --engine rey", "unknown engine 'rey'. Did you mean 'ray'?"),
         ("sweep s.yaml --address auto", "none without --engine ray"),
         ("sweep s.yaml --out s.yaml", "--out: got s.yaml; valid: a folder"),

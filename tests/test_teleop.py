@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pyarrow import parquet
 
 from grr_torch.applications.example_paths import KINDS, example_path, middles
 from grr_torch.applications.replay import read_waypoints, replay
@@ -196,15 +197,19 @@ def test_a_log_says_what_its_steps_were(planar_roadmap):
         TeleoperationLog(planar_roadmap, 50.0).summary()
 
 
-def test_trajectories_are_written_in_three_formats(kinova_roadmap, tmp_path):
+def test_trajectories_are_written_in_four_formats(kinova_roadmap, tmp_path):
     log = replay(Teleoperator(kinova_roadmap), example_path(kinova_roadmap, "circle")[:40])
-    for suffix in ("csv", "npy", "npz"):
+    for suffix in ("csv", "npy", "npz", "parquet", "NPY"):
         log.save_trajectory(tmp_path / f"q.{suffix}")
     q = log.configurations.numpy()
     table = np.genfromtxt(tmp_path / "q.csv", delimiter=",", names=True)
     assert table.dtype.names == ("time", *kinova_roadmap.robot.joint_names)
-    assert np.allclose(np.array(table.tolist())[:, 1:], q, atol=1e-8)
-    assert np.array_equal(np.load(tmp_path / "q.npy", allow_pickle=False), q)
+    assert np.array_equal(np.array(table.tolist())[:, 1:], q)
+    for name in ("q.npy", "q.NPY"):
+        assert np.array_equal(np.load(tmp_path / name, allow_pickle=False), q)
+    columns = parquet.read_table(tmp_path / "q.parquet")
+    assert columns.column_names == list(table.dtype.names)
+    assert np.array_equal(np.column_stack([column.to_numpy() for column in columns.columns[1:]]), q)
     with np.load(tmp_path / "q.npz", allow_pickle=False) as data:
         assert np.array_equal(data["configurations"], q)
         assert np.array_equal(data["targets"], log.targets.numpy())
@@ -240,5 +245,18 @@ def test_waypoints_are_read_from_tables(tmp_path):
     np.save(tmp_path / "c.npy", table)
     for name in ("a.csv", "c.npy"):
         assert np.array_equal(read_waypoints(tmp_path / name, 2).numpy(), table)
-    with pytest.raises(FileFormatError, match="has 2 columns; valid: 3"):
+    with pytest.raises(FileFormatError, match="has columns named x, y; valid: each of x, y, z once"):
         read_waypoints(tmp_path / "a.csv", 3)
+
+
+@pytest.mark.parametrize("stop", [Session.let_go, Session.reset, Session.engage])
+def test_an_arm_that_is_stopped_brakes(roadmap, stop):
+    session = Session(Teleoperator(roadmap, acceleration_limits=2.0))
+    session.nudge(0, 0.2)
+    q = [session.tick().configuration for _ in range(20)]
+    stop(session)
+    q += [session.tick().configuration for _ in range(60)]
+    moved = torch.stack(q).diff(dim=0)
+    assert float(moved[15].abs().max()) > 1e-3
+    assert float(moved[-1].abs().max()) < 1e-3
+    assert float(moved.diff(dim=0).abs().max()) * session.rate**2 <= 2.0 * (1.0 + 1e-6)

@@ -70,7 +70,7 @@ def test_foresight_is_that_of_the_teleoperator(kinova_roadmap, tmp_path):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ("MAP --path none.csv", "none.csv: is not a file"),
+        ("MAP --path none.csv", "none.csv: does not exist"),
         ("MAP --path circel", "unknown path 'circel'. Did you mean 'circle'?"),
         ("MAP --path empty.csv", "empty.csv: holds no points"),
         ("MAP --path head.csv", "head.csv: holds no points"),
@@ -80,7 +80,10 @@ def test_foresight_is_that_of_the_teleoperator(kinova_roadmap, tmp_path):
         ("MAP --path words.npy", "words.npy: holds an array of shape"),
         ("MAP --path pickle.npy", "pickle.npy: is not a table of numbers"),
         ("MAP --path .", "got .; valid: a file that ends in"),
-        ("MAP --path circle --out q.txt", "a name that ends in .csv, .npy, .npz"),
+        ("MAP --path circle --out q.txt", "--out: got q.txt; valid: a file that ends in .csv, .npy, .npz, .parquet"),
+        ("MAP --path circle --record q.txt", "--record: got q.txt; valid: a file that ends in .rrd"),
+        ("MAP --path circle --host 0.0.0.0", "--host: got 0.0.0.0; valid: none with --path"),
+        ("MAP --path circle --port 0", "--port: got 0; valid: none with --path"),
         ("MAP --path circle --out no/q.csv", "folder 'no' does not exist"),
         ("MAP --path circle --record .", "it is a folder"),
         ("MAP --path nan.csv --out nan.csv", "another file than those that are read"),
@@ -92,7 +95,7 @@ def test_foresight_is_that_of_the_teleoperator(kinova_roadmap, tmp_path):
         ("MAP --path circle --foresight nan", "foresight: got nan"),
         ("MAP --path circle --max-step -1", "max_step: got -1.0"),
         ("MAP --port 70000", "Invalid value for '--port'"),
-        ("none.grr --path circle", "none.grr: is not a file"),
+        ("none.grr --path circle", "none.grr: does not exist"),
         ("wide.csv --path circle", "truncated or not a roadmap"),
     ],
 )

@@ -6,11 +6,14 @@ import torch
 from teleoperated import follow_targets, some_vertices
 
 import grr_torch
+from grr_torch.applications.braking import limit_acceleration
+from grr_torch.applications.lines import Follower
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.steps import Steps
 from grr_torch.applications.straight import Straight
 from grr_torch.applications.teleoperate import STATUSES, Teleoperator
 from grr_torch.experiments.paths import draw_paths
+from grr_torch.projection.project import Tolerances
 
 
 @pytest.fixture(scope="module")
@@ -225,3 +228,38 @@ def test_routes_leave_out_the_edges_that_are_avoided(roadmap):
         assert (longer >= cost - 1e-12).all()
         cost = longer
     assert routes.towards(goal)[0][start] < cost[start], "others still take them"
+
+
+def test_beside_a_joint_beyond_its_limit_the_others_keep_theirs(kinova):
+    """Of a way to a standstill, whatever one joint is at."""
+    robot, task = kinova, grr_torch.Position(3)
+    follower = Follower(robot, task, Tolerances(), torch.full((7,), 0.04, dtype=torch.float64))
+    gain = torch.full((7,), 1e-3, dtype=torch.float64)
+    joints = (robot.upper.isfinite() & ~robot.continuous).nonzero()[:2, 0].tolist()
+    q = robot.sample(200, torch.Generator().manual_seed(0))
+    q[:, joints[1]] = robot.upper[joints[1]] - 0.01
+    motion = torch.zeros_like(q)
+    motion[:, joints[1]] = 0.02
+    for outside in (0.0, 1e-3):
+        q[:, joints[0]] = robot.upper[joints[0]] + outside
+        nowhere = torch.full_like(q, torch.nan)
+        moved = limit_acceleration(follower, gain, q, motion, q + motion, nowhere)
+        assert bool((moved[:, joints[1]] < 0.02).all())
+        back = motion.clone()
+        back[:, joints[1]], back[:, joints[0]] = 0.0, -1e-3
+        inward = limit_acceleration(follower, gain, q, torch.zeros_like(q), q + back, nowhere)
+        assert bool((inward[:, joints[0]] < 0.0).any())
+
+
+def test_a_reset_forgets_the_target_and_not_the_speed(roadmap):
+    vertices = some_vertices(roadmap, 2, 11)
+    start, goal = roadmap.configurations[vertices[0]], roadmap.points[vertices[1]]
+    teleoperator = Teleoperator(roadmap, start=start, acceleration_limits=2.0)
+    q = [start] + [teleoperator.step(goal).configuration for _ in range(25)]
+    teleoperator.reset()
+    q += [teleoperator.step(roadmap.points[vertices[0]]).configuration for _ in range(25)]
+    accelerations = torch.stack(q).diff(dim=0).diff(dim=0).abs() * 50.0**2
+    assert float(accelerations.max()) <= 2.0 * (1.0 + 1e-6)
+    teleoperator.reset(q[-1])
+    still = teleoperator.step(torch.full((3,), torch.nan, dtype=torch.float64))
+    assert torch.equal(still.configuration, q[-1])

@@ -53,6 +53,8 @@ class Arms:
             where there is no such place.
         looks_in: (B,) steps until it is looked for again.
         caught_up: (B,) steps for which the arm has been next to its target.
+        tries: (B,) how often no way back to the map was found, less how often one was.
+        rests: (B,) steps for which an arm does not look for one.
         avoided: Of each arm, the edges that it could not follow since it last went straight.
     """
 
@@ -89,6 +91,8 @@ class Arms:
     meets: Array
     looks_in: Array
     caught_up: Array
+    tries: Array
+    rests: Array
     avoided: list[frozenset[tuple[int, int]]]
 
     @staticmethod
@@ -134,6 +138,8 @@ class Arms:
             meets=unknown(width),
             looks_in=np.zeros(count, dtype=np.int64),
             caught_up=np.zeros(count, dtype=np.int64),
+            tries=np.zeros(count, dtype=np.int64),
+            rests=np.zeros(count, dtype=np.int64),
             avoided=[frozenset()] * count,
         )
         arms.look(follower, np.arange(count))

@@ -56,10 +56,6 @@ class Around:
         """Ranks that there are: from a point beyond all numbers the tree finds none."""
         return np.minimum(nearest, self._count - 1)
 
-    def within(self, places: Array, radius: float) -> Array:
-        """Lists of the ranks of vertices within a radius [m] of places (N, d)."""
-        return self._tree.query_ball_point(places, radius)
-
     def nearest(self, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """The k nearest: distances (N, k) [m] and ranks (N, k)."""
         distances, index = self._tree.query(points[:, : self._d].numpy(), k=range(1, min(k, self._count) + 1))

@@ -8,6 +8,7 @@ from torch import Tensor
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.motions import SUBSTEPS
 from grr_torch.applications.rejoin import clearance
+from grr_torch.robots.few import LIMITS_SLACK
 from grr_torch.spaces.configuration import difference
 
 # a joint that is to move less [rad or m] is at rest
@@ -59,5 +60,7 @@ def _can_stop(follower: Follower, gain: Tensor, q: Tensor, motion: Tensor) -> Te
     fractions = torch.arange(count + 1, dtype=q.dtype, device=q.device)[:, None, None] / count
     apart = clearance(follower, q + fractions * way)
     free = (apart >= apart[0].clamp_max(0.0) - 1e-9).all(0)
-    inward = robot.within_limits(q + way) | ~robot.within_limits(q)
-    return free & inward
+    # a joint that is beyond a limit goes no farther out
+    end, slack = q + way, LIMITS_SLACK
+    lower, upper = torch.minimum(q, robot.lower) - slack, torch.maximum(q, robot.upper) + slack
+    return free & ((end >= lower) & (end <= upper)).all(1)

@@ -118,15 +118,17 @@ def _deviation(roadmap: Roadmap, ways: list[Way]) -> tuple[float, float]:
     """Largest and mean distance of the tool from the ways' straight lines [m], at the substeps of a controller."""
     robot = roadmap.robot
     d = roadmap.task.dimension
-    found = [torch.zeros(1, dtype=robot.dtype)]
+    found: list[Tensor] = []
     for way in ways:
         if way.straight:
-            q = torch.cat([way.configurations, substeps(way.configurations, robot.continuous).flatten(0, 1)])
+            # a way begins where the one before it ended
+            start = way.configurations[: 0 if found else 1]
+            q = torch.cat([start, substeps(way.configurations, robot.continuous).flatten(0, 1)])
             position = robot.forward_kinematics(q)[0][:, :d]
-            start, line = way.points[0, :d], way.points[-1, :d] - way.points[0, :d]
-            share = ((position - start) @ line / line.square().sum().clamp_min(1e-24)).clamp(0.0, 1.0)
-            found.append((position - start - share[:, None] * line).norm(dim=1).cpu())
-    every = torch.cat(found)
+            origin, line = way.points[0, :d], way.points[-1, :d] - way.points[0, :d]
+            share = ((position - origin) @ line / line.square().sum().clamp_min(1e-24)).clamp(0.0, 1.0)
+            found.append((position - origin - share[:, None] * line).norm(dim=1).cpu())
+    every = torch.cat(found) if found else torch.zeros(1)
     return float(every.max()), float(every.mean())
 
 

@@ -12,7 +12,7 @@ from grr_torch.applications.detours import Detours
 from grr_torch.applications.hold import LEVELS, NEARER, much_nearer, nearest_feasible
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.pursuit import Pursuit
-from grr_torch.applications.rejoin import rejoin
+from grr_torch.applications.rejoin import SHARES, rejoin
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
 from grr_torch.applications.steps import DETOURING, HOLDING, TRACKING, UNREACHABLE, Steps
@@ -27,6 +27,8 @@ _GRADUALLY = 4
 _HESITATION = 2
 # an arm so near [rad or m] to the map's configuration at its place is on the map
 _ON_MAP = 0.05
+# steps for which an arm that found no way back to the map, with steps of any length, does not look for one
+_REST = 5
 # what is so much nearer to the target [m] is worth a detour, however far off that is
 _MUCH = 0.05
 
@@ -246,13 +248,24 @@ class Pilot:
         return left & on_way
 
     def _back(self, arms: Arms, arm: int, goal_q: Array) -> Array | None:
-        """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near."""
+        """A step of an arm off its map: towards its goal, the map at its own place, or a vertex, whichever is near.
+
+        Where it finds no way, to look again takes long.
+        """
         arms.end_detour(np.array([arm]))
+        if arms.rests[arm] > 0:
+            arms.rests[arm] -= 1
+            return None
         near = self.solver.nearest(torch.from_numpy(arms.p[arm][None]), _WAYS_BACK)[1][0]
         ends = self.solver.configurations[near].numpy()
         here = self.solver.solve_columns(torch.from_numpy(arms.p[arm][:, None]))[0].T.numpy()
         if not self.follower.distance(here, arms.q[arm])[0] <= _ON_MAP:
             ends = np.concatenate([goal_q[None], here, ends])
         ends = ends[np.isfinite(ends).all(1)]
-        step = rejoin(self.follower, torch.from_numpy(arms.q[arm]), torch.from_numpy(ends))
-        return None if step is None else step.numpy()
+        step = rejoin(self.follower, torch.from_numpy(arms.q[arm]), torch.from_numpy(ends), int(arms.tries[arm]))
+        if step is not None:
+            arms.tries[arm] = max(arms.tries[arm] - 1, 0)
+            return step.numpy()
+        arms.tries[arm] += 1
+        arms.rests[arm] = _REST if arms.tries[arm] >= len(SHARES) else 0
+        return None

@@ -77,7 +77,8 @@ class Planner:
         robot = self.robot
         if (point is None) == (configuration is None):
             given = "neither" if point is None else "both"
-            raise ParameterError(name, f"{given} of a point and a configuration", "one of them")
+            valid = f"{name} or {name}_configuration"
+            raise ParameterError(name, f"{given} of a point and a configuration", valid)
         if point is not None:
             column = point_columns(robot, self.task, point)
             if point.ndim != 1:
@@ -105,8 +106,9 @@ class Planner:
         if direct is not None:
             return [direct]
         open_edges = self.roadmap.connected.clone()
-        for _ in range(_DETOURS):
-            stops = self._route(start, goal, Routes(self.roadmap, open_edges))
+        for detour in range(_DETOURS):
+            routes = Routes(self.roadmap, open_edges) if detour else Routes.of(self.roadmap)
+            stops = self._route(start, goal, routes)
             if isinstance(stops, _Refusal):
                 return stops
             off_map = torch.zeros(len(stops) - 1, dtype=torch.bool)

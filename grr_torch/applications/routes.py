@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -17,8 +18,13 @@ from grr_torch.spaces.configuration import difference
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
 
-# goals, with the edges that are avoided on the way, whose shortest paths are remembered
-_GOALS = 256
+# goals, with the edges that are avoided on the way, whose shortest paths are remembered at most, and what those may
+# take in all [bytes]
+_GOALS, _REMEMBERED = 256, 1 << 29
+# of a vertex, a length and the next vertex [bytes]
+_VERTEX = 12
+# routes along all connected edges, by roadmap
+_kept: WeakKeyDictionary[Roadmap, Routes] = WeakKeyDictionary()
 
 
 class Routes:
@@ -46,7 +52,15 @@ class Routes:
         lengths = np.maximum(lengths, 1e-9)
         self._graph = csr_matrix((lengths, (first.numpy(), second.numpy())), shape=(vertices, vertices))
         self.part: np.ndarray = connected_components(self._graph, directed=False)[1]
-        self.towards = lru_cache(_GOALS)(self._towards)
+        fitting = _REMEMBERED // (_VERTEX * max(1, vertices))
+        self.towards = lru_cache(min(_GOALS, max(1, fitting)))(self._towards)
+
+    @staticmethod
+    def of(roadmap: Roadmap) -> Routes:
+        """Those along all connected edges: made once, and kept as long as the roadmap is."""
+        if roadmap not in _kept:
+            _kept[roadmap] = Routes(roadmap)
+        return _kept[roadmap]
 
     def _towards(self, goal: int, avoided: frozenset[tuple[int, int]] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
         """Shortest paths to a vertex.

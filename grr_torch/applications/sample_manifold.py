@@ -98,22 +98,12 @@ class Sampler:
         targets = self.target.expand(-1, q.shape[1]).contiguous()
         return project_columns(self.robot, self.task, targets, q + motion, self.tolerances, check_collision=False)
 
-    def _tree(self, q: Tensor) -> cKDTree:
-        """A search tree that knows that continuous joints wrap."""
-        turns = self.robot.continuous.cpu().numpy()
-        return cKDTree(self._in_box(q), boxsize=np.where(turns, 2.0 * math.pi, 0.0))
-
-    def _in_box(self, q: Tensor) -> np.ndarray:
-        rows: np.ndarray = q.T.cpu().numpy().astype(np.float64)
-        turns = self.robot.continuous.cpu().numpy()
-        box = np.mod(rows, 2.0 * math.pi)
-        return np.where(turns, np.where(box >= 2.0 * math.pi, 0.0, box), rows)
-
     def _nearest_pairs(self, q: Tensor, k: int, progress: Progress) -> Tensor:
         """Each sample of q (n, S) with its k nearest: (P, 2), each pair once."""
         count = q.shape[1]
         progress("joining components", 0, _ROUNDS)
-        nearest = self._tree(q).query(self._in_box(q), k=range(1, min(k + 1, count) + 1))[1]
+        wraps = self.robot.continuous
+        nearest = search_tree(q, wraps).query(in_box(q, wraps), k=range(1, min(k + 1, count) + 1))[1]
         first = np.repeat(np.arange(count), nearest.shape[1])
         return _pairs(first, nearest.ravel()).to(q.device)
 
@@ -121,10 +111,11 @@ class Sampler:
         """Samples of each component but the largest with the nearest ones of all others: (P, 2)."""
         found = [np.empty((0, 2), dtype=np.int64)]
         sizes = labels.bincount()
-        rows, of = self._in_box(q), labels.cpu().numpy()
+        wraps = self.robot.continuous
+        rows, of = in_box(q, wraps), labels.cpu().numpy()
         for label in sizes.argsort(descending=True)[1:].tolist():
             inside, outside = np.flatnonzero(of == label), np.flatnonzero(of != label)
-            tree = self._tree(q[:, torch.from_numpy(outside).to(q.device)])
+            tree = search_tree(q[:, torch.from_numpy(outside).to(q.device)], wraps)
             ranks = range(1, min(_ACROSS, len(outside)) + 1)
             gaps, nearest = tree.query(rows[inside], k=ranks)
             close = gaps[:, 0].argsort(kind="stable")[:_TRIED]
@@ -152,6 +143,18 @@ class Sampler:
             epsilon=_EPSILON,
             tolerances=self.tolerances,
         )
+
+
+def search_tree(q: Tensor, continuous: Tensor) -> cKDTree:
+    """A search tree of configurations (n, S) by D_q, to be asked for what `in_box` gives."""
+    return cKDTree(in_box(q, continuous), boxsize=np.where(continuous.cpu().numpy(), 2.0 * math.pi, 0.0))
+
+
+def in_box(q: Tensor, continuous: Tensor) -> np.ndarray:
+    """Configurations (n, S) as rows (S, n), continuous joints in [0, 2π)."""
+    rows: np.ndarray = q.T.cpu().numpy().astype(np.float64)
+    box = np.mod(rows, 2.0 * math.pi)
+    return np.where(continuous.cpu().numpy(), np.where(box >= 2.0 * math.pi, 0.0, box), rows)
 
 
 def _pairs(first: np.ndarray, second: np.ndarray) -> Tensor:

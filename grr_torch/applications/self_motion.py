@@ -11,7 +11,7 @@ from torch import Tensor
 from grr_torch.applications.components import joint_ranges, places
 from grr_torch.applications.sample_manifold import Sampler
 from grr_torch.applications.trace_curves import Curves, End, Tracer
-from grr_torch.errors import ParameterError, check_seed
+from grr_torch.errors import ParameterError, check_seed, check_whole
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, point_columns, project, project_columns
@@ -142,8 +142,8 @@ def self_motion_manifold(
         robot: The robot.
         task: The task space; it must leave at least one joint to spare.
         point: (width,) the point of the task space.
-        samples: Random starts; in more than one dimension also, how many samples there are at most. Components on
-            which none of them falls are missed.
+        samples: Random starts; in more than one dimension how many samples there are at most, half as many starts
+            among them. Components on which no start falls are missed.
         step: Longest step along a curve, 0.05 by default, or length of the random steps, 0.3 by default [rad].
         seed: Of all random draws.
         tolerances: When a configuration counts as being at the point; samples are within 1e-6 m and 1e-5 rad at least.
@@ -165,8 +165,7 @@ def self_motion_manifold(
     step = (_CURVE_STEP if dimension == 1 else _STEP) if step is None else step
     if not 1e-3 <= step <= 0.5:
         raise ParameterError("step", step, "0.001 to 0.5 rad")
-    if isinstance(samples, bool) or not isinstance(samples, int) or not 1 <= samples <= _MOST_SAMPLES:
-        raise ParameterError("samples", samples, f"a whole number from 1 to {_MOST_SAMPLES:,}")
+    samples = check_whole("samples", samples, 1, _MOST_SAMPLES)
     target = _target(robot, task, point)
     close = replace(
         tolerances, position=min(tolerances.position, _POSITION), rotation=min(tolerances.rotation, _ROTATION)
@@ -217,7 +216,7 @@ def _target(robot: Robot, task: TaskSpace, point: Tensor | Sequence[float]) -> T
         row = point if isinstance(point, Tensor) else torch.tensor(point, dtype=torch.float64)
     except (ValueError, TypeError, RuntimeError) as error:
         raise ParameterError("point", point, f"{task.width} numbers") from error
-    if row.ndim != 1:
+    if row.shape != (task.width,):
         raise ParameterError("point shape", tuple(row.shape), f"({task.width},): one point")
     return point_columns(robot, task, row[None])
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from grr_torch.applications.around import Around, AroundProduct
-from grr_torch.applications.joined import MATRIX, Joined
+from grr_torch.applications.joined import Joined
 from grr_torch.applications.many_guesses import MOST_VERTICES, ManyGuesses
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import FEW, Array, Mask, cores, one_thread
@@ -24,6 +24,7 @@ from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
 from grr_torch.spaces.configuration import average, average_of_few, difference, embed
 from grr_torch.spaces.graph import find_lattice
+from grr_torch.spaces.pyramids import pyramid_corners, pyramid_weights
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -35,6 +36,8 @@ _SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_C
 # points worked on together, on the CPU and on a GPU: enough that the few that do not converge cost little beside them,
 # and on the CPU, where rotation varies and a point has three times as many vertices around it, fewer for the memory
 _AT_ONCE, _TURNING, _ON_GPU = 1 << 14, 1 << 12, 1 << 16
+# a corner of a pyramid that has no more weight at a point has none: the point is on a face without it
+_ON_FACE = 1e-9
 # radians of self-motion from the average beyond which a configuration is none of the map's
 _OFF_MAP = 0.5
 
@@ -47,7 +50,8 @@ class Solution:
         configurations: (*batch, n) configurations; NaN where not valid.
         valid: (*batch,) bool: the tool is at the point, within limits and free of self-collision.
         status: (*batch,) array of text. Of valid ones: "solved", or "uncertified" in a cell inside which the map may
-            not be continuous (where rotation varies, near a corner of such a cell, as far as cells were measured). Of
+            not be continuous, or of which a corner is not resolved (where rotation varies, or without a grid, next to
+            a corner of a cell of the first kind, as far as cells were measured). Of
             others: "outside" the roadmap's bounds, "too far" from every resolved vertex, "not converged", "off the
             map", where the projection ends in another posture than the vertices around have, or in "self-collision";
             and of the differentiable map, "no cell" where a corner of the cell is not resolved or an edge of it is
@@ -96,11 +100,8 @@ class Solver:
         self._embedded_array, self._continuous_array = self._embedded.numpy(), self._continuous.numpy()
         self._joined = Joined(roadmap, vertices)
         # where rotation varies, suspects are looked up by their nearest vertices
-        self._lattice = None if turning else find_lattice(roadmap.points)
+        self._lattice, self._resolved = None if turning else find_lattice(roadmap.points), roadmap.resolved
         self._suspect = self._uncertified_places(roadmap)
-        # of a large roadmap, such a table would take long to make; without a grid there is no other way
-        small = self._suspect is not None and (self._lattice is None or len(vertices) <= MATRIX)
-        self._near_suspect = self._near_uncertified(roadmap) if small else None
 
     def __call__(self, points: Tensor, *, progress: Progress = silent) -> Solution:
         """`Roadmap.solve`."""
@@ -232,42 +233,27 @@ class Solver:
         return distances, self.vertices[index]
 
     def _mark_uncertified(self, codes: NDArray[np.uint8], positions: NDArray[Any], nearest: NDArray[Any]) -> None:
-        """Sets the codes of points in uncertified cells: by their pyramids in a grid, else by their nearest vertex."""
-        if self._suspect is None:
-            return
-        rows = np.arange(len(nearest))
-        if self._near_suspect is not None:
-            rows = self._near_suspect[nearest].nonzero()[0]
-        if self._lattice is not None and len(rows):
-            places = self._lattice.pyramids(torch.from_numpy(positions[rows]) - self.low)
-            rows = rows[self._suspect[places].numpy()]
-        codes[rows] = _UNCERTIFIED
+        """Sets the codes of points in uncertified cells: by their pyramids in a grid, else by their nearest vertex.
 
-    def _near_uncertified(self, roadmap: Roadmap) -> NDArray[np.bool_]:
-        """(R,) resolved vertices that may be nearest to a point in an uncertified cell; without a grid, its corners.
-
-        Such a point lies within the longest edge of a corner of its cell, and its nearest vertex is no farther.
+        In a grid, no more is known where a pyramid lacks a corner, but for its faces that do not have that.
         """
-        corners = torch.cat([cells.reshape(-1) for cells in roadmap.uncertified]).unique()
-        if not isinstance(self._around, Around) or self._lattice is None:
-            return np.isin(self.vertices.numpy(), corners.numpy())
-        places = roadmap.points[corners, : self.task.dimension].numpy()
-        marked = np.zeros(len(self.vertices), dtype=bool)
-        for found in self._around.within(places, 2.0 * self.radius + 1e-9):
-            marked[found] = True
-        return marked
-
-    def _uncertified_places(self, roadmap: Roadmap) -> Tensor | None:
-        """(P,) bool by pyramid, the last one false for what is outside; None if every cell is certified.
-
-        Without a grid there are no pyramids, and no entries.
-        """
-        cells = [corners for corners in roadmap.uncertified if len(corners)]
-        if not cells:
-            return None
         if self._lattice is None:
-            return torch.zeros(0, dtype=torch.bool)
+            codes[self._suspect[nearest].numpy()] = _UNCERTIFIED
+            return
+        offsets = torch.from_numpy(positions) - self.low
+        places = self._lattice.pyramids(offsets)
+        suspect, lacking = self._suspect[places], ~self._resolved[pyramid_corners(self._lattice, places.clamp_min(0))]
+        rows = (lacking.any(1) & (places >= 0)).nonzero()[:, 0]
+        weights = pyramid_weights(self._lattice, offsets[rows], places[rows])
+        suspect[rows] |= (lacking[rows] & (weights > _ON_FACE)).any(1)
+        codes[suspect.numpy()] = _UNCERTIFIED
+
+    def _uncertified_places(self, roadmap: Roadmap) -> Tensor:
+        """(P,) bool by pyramid, the last one for what is outside; without a grid, (R,) by resolved vertex."""
+        if self._lattice is None:
+            corners = torch.cat([cells.reshape(-1) for cells in roadmap.uncertified])
+            return torch.isin(self.vertices, corners)
         suspect = torch.zeros(2 * len(self._lattice.cells) * math.prod(self._lattice.cells) + 1, dtype=torch.bool)
-        for corners in cells:
+        for corners in roadmap.uncertified:
             suspect[self._lattice.pyramids_at(corners)] = True
         return suspect

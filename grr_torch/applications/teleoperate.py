@@ -136,7 +136,8 @@ class Teleoperator:
         """Starts anew: the next target is taken wherever it is, and no input is too old.
 
         Args:
-            configuration: (*batch, n) where the arms stand, as measured; by default where they were commanded to.
+            configuration: (*batch, n) where the arms stand, as measured, at rest; by default they are where they were
+                commanded to, as fast as they are.
 
         Raises:
             ParameterError: It is not finite, or its last axis is not n.
@@ -148,7 +149,8 @@ class Teleoperator:
                 raise ParameterError("configuration", "NaN or infinite values", "finite values")
             self._batch, self._arms = configuration.shape[:-1], Arms.at(self._follower, q.numpy().copy())
         elif self._arms is not None:
-            self._arms = Arms.at(self._follower, self._arms.q)
+            speed, self._arms = self._arms.speed, Arms.at(self._follower, self._arms.q)
+            self._arms.speed = speed
         self._last: Array | None = None
         self._now, self._freshest, self._early = 0.0, math.inf, math.nan
 

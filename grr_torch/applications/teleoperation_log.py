@@ -19,11 +19,10 @@ from grr_torch.output import atomic_write
 from grr_torch.pieces import one_thread
 from grr_torch.projection.project import tool_points
 from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.tables import table_writer, unique_names
 
 # an arm stalls when no joint moves more than this in a step [rad or m] though its tool has farther to go than that [m]
 STILL, AWAY = 1e-4, 0.01
-
-TRAJECTORY_SUFFIXES = (".csv", ".npy", ".npz")
 
 
 @dataclass(frozen=True)
@@ -202,46 +201,35 @@ class TeleoperationLog:
     def save_trajectory(self, path: str | os.PathLike[str]) -> None:
         """Writes the joint trajectory, by an atomic rename.
 
-        `.csv`: time and joints, with a header; `.npy`: configurations (T, n); `.npz`: `time`, `configurations`,
-        `targets`, `tools`, `status`, `clearance` and `joint_names`.
+        `.csv` and `.parquet`: time and joints, by name; `.npy`: configurations (T, n); `.npz`: `time`,
+        `configurations`, `targets`, `tools`, `status`, `clearance` and `joint_names`.
 
         Raises:
             ParameterError: The name ends in something else.
             OutputError: It cannot be written.
         """
-        check_trajectory_path(path)
-        names, q = self.roadmap.robot.joint_names, self.configurations.numpy()
-        with atomic_write(path) as temporary, temporary.open("wb") as file:
-            if temporary.suffix == ".npy":
-                np.save(file, np.ascontiguousarray(q))
-            elif temporary.suffix == ".csv":
-                table = np.column_stack([self.times.numpy(), q])
-                np.savetxt(file, table, "%.9g", ",", header=",".join(["time", *names]), comments="")
-            else:
-                np.savez_compressed(
-                    file,
-                    time=self.times.numpy(),
-                    configurations=q,
-                    targets=self.targets.numpy(),
-                    tools=self.tools.numpy(),
-                    status=self.status,
-                    clearance=self.clearances.numpy(),
-                    joint_names=np.array(names),
-                )
+        path, names = Path(path), self.roadmap.robot.joint_names
+        if path.suffix.lower() == ".npy":
+            # not a table's columns: controllers read an array
+            with atomic_write(path) as temporary, temporary.open("wb") as file:
+                np.save(file, np.ascontiguousarray(self.configurations.numpy()))
+            return
+        columns = {"time": ["time"], "configurations": unique_names(names, ("time",))}
+        with table_writer(path, columns, len(self), {"joint_names": np.array(names)}) as write:
+            write(
+                {
+                    "time": self.times.numpy(),
+                    "configurations": self.configurations.numpy(),
+                    "targets": self.targets.numpy(),
+                    "tools": self.tools.numpy(),
+                    "status": self.status,
+                    "clearance": self.clearances.numpy(),
+                }
+            )
 
     def _table(self) -> Tensor:
         # an array cannot grow while something looks into it
         return torch.from_numpy(np.array(self._rows[:])).reshape(-1, self._width)
-
-
-def check_trajectory_path(path: str | os.PathLike[str]) -> None:
-    """Finds out whether a trajectory can be written in the format that a name asks for.
-
-    Raises:
-        ParameterError: It cannot.
-    """
-    if Path(path).suffix not in TRAJECTORY_SUFFIXES:
-        raise ParameterError("trajectory file", path, f"a name that ends in {', '.join(TRAJECTORY_SUFFIXES)}")
 
 
 def longest_time(flags: Tensor, durations: Tensor) -> float:

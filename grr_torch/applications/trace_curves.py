@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from grr_torch.applications.sample_manifold import in_box, search_tree
 from grr_torch.progress import Progress
 from grr_torch.projection.columns import null_space_projector
 from grr_torch.projection.project import Tolerances, project_columns
@@ -139,16 +141,15 @@ class Tracer:
         One does if steps from the curve's nearest sample come to it.
         """
         on = torch.zeros(configurations.shape[1], len(curves.ends), dtype=torch.bool, device=configurations.device)
+        wraps = self.robot.continuous
+        rows = in_box(configurations, wraps)
         shifts = curves.curve.bincount(minlength=len(curves.ends)).cumsum(0).tolist()
         for number, (start, end) in enumerate(zip([0, *shifts], shifts, strict=False)):
             samples, tangents = curves.configurations[:, start:end], curves.tangents[:, start:end]
-            motions = difference(samples[:, :, None], configurations[:, None], self.robot.continuous[:, None, None])
-            gap, nearest = motions.norm(dim=0).min(0)
-            near = (gap <= 1.5 * self.step).nonzero()[:, 0]
-            near_samples = nearest[near]
-            on[near, number] = self._leads_to(
-                samples[:, near_samples], tangents[:, near_samples], configurations[:, near]
-            )
+            gap, nearest = search_tree(samples, wraps).query(rows, distance_upper_bound=1.5 * self.step)
+            near = np.isfinite(gap)
+            starts, goals = (torch.from_numpy(part).to(on.device) for part in (nearest[near], near.nonzero()[0]))
+            on[goals, number] = self._leads_to(samples[:, starts], tangents[:, starts], configurations[:, goals])
         return on
 
     def _one_way(self, starts: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

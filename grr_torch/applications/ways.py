@@ -99,7 +99,8 @@ class WayFinder:
     def on_lines(self, starts: Stops, ends: Stops) -> list[Way | None]:
         """Ways on straight task-space lines, each waypoint projected from the middle of its two neighbours.
 
-        So IsContinuous follows an edge, wherefore this finds a way along every connected one.
+        So IsContinuous follows an edge, wherefore this finds a way along every connected one, but for those that graze
+        the arm between the points that it looks at: here there are more of them.
         """
         solver = self.solver
         wraps = solver.robot.continuous[:, None]

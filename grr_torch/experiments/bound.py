@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -110,15 +110,7 @@ def measure_bound(
     slopes = _slopes(roadmap, graph, labels, own)
     bounds: list[Bound] = []
     for number in left_out:
-        truncated = float(slopes.topk(number).values[-1]) if number else torch.inf
-        search = Search(graph, _tables(roadmap, graph, labels, truncated, progress))
-        done = 0
-        while done < iterations and search.best - search.bound > _MET * search.best:
-            progress("passing messages", done, iterations)
-            search.go_on()
-            done += 1
-        progress("passing messages", iterations, iterations)
-        found = mean_without(_slopes(roadmap, graph, labels, search.chosen), number)
+        found = _search(roadmap, graph, labels, slopes, number, iterations, progress)
         smoothness = mean_without(slopes, number)
         bounds.append(
             Bound(
@@ -129,15 +121,39 @@ def measure_bound(
                 left_out=number,
                 samples=samples,
                 spacing=(float(spacing.median()), float(spacing.max())),
-                iterations=done,
+                iterations=found.iterations,
                 smoothness=smoothness,
-                best=min(smoothness, found),
-                bound=bound_without(search.bound, len(slopes), number, truncated),
+                best=min(smoothness, found.best),
+                bound=found.bound,
                 seconds=time.perf_counter() - begin,
             )
         )
         begin = time.perf_counter()
     return bounds
+
+
+class _Found(NamedTuple):
+    """What message passing comes to, of all edges but some: mean slope of its choice, a bound of all, iterations."""
+
+    best: float
+    bound: float
+    iterations: int
+
+
+def _search(
+    roadmap: Roadmap, graph: Graph, labels: Tensor, slopes: Tensor, left_out: int, iterations: int, progress: Progress
+) -> _Found:
+    """Passes messages. The tables are gone when it returns: those of the next search are as large as they."""
+    truncated = float(slopes.topk(left_out).values[-1]) if left_out else torch.inf
+    search = Search(graph, _tables(roadmap, graph, labels, truncated, progress))
+    done = 0
+    while done < iterations and search.best - search.bound > _MET * search.best:
+        progress("passing messages", done, iterations)
+        search.go_on()
+        done += 1
+    progress("passing messages", iterations, iterations)
+    best = mean_without(_slopes(roadmap, graph, labels, search.chosen), left_out)
+    return _Found(best, bound_without(search.bound, len(slopes), left_out, truncated), done)
 
 
 def bound_without(total: float, edges: int, left_out: int, truncated: float) -> float:

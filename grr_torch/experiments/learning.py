@@ -17,11 +17,9 @@ from grr_torch.learning.options import Epoch, TrainingOptions
 from grr_torch.learning.region import certified_region
 from grr_torch.learning.train import train_ik
 from grr_torch.progress import Progress, silent
-from grr_torch.projection.project import Tolerances, point_columns, project, project_columns
+from grr_torch.projection.project import Tolerances, project
 from grr_torch.resolution.roadmap import Roadmap
-from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import difference
-from grr_torch.spaces.task import TaskSpace
 
 LABELS = {
     "roadmap": "the roadmap's configurations",
@@ -183,14 +181,6 @@ def compare_warm_starts(ik: NeuralIK, roadmap: Roadmap, *, points: int = 20_000,
 
     return [
         row("roadmap.solve", mapped),
-        row("network, projection", lambda: _project(robot, task, held_out, ik(held_out), tolerances)),
+        row("network, projection", lambda: project(robot, task, held_out, ik(held_out), tolerances=tolerances)),
         row("network, two Newton steps", lambda: ik.refine(held_out)),
     ]
-
-
-def _project(
-    robot: Robot, task: TaskSpace, points: Tensor, guesses: Tensor, tolerances: Tolerances
-) -> tuple[Tensor, Tensor]:
-    columns = point_columns(robot, task, points), robot.columns(guesses)
-    q, valid = project_columns(robot, task, *columns, tolerances)
-    return q.T, valid

@@ -56,7 +56,8 @@ def draw_paths(roadmap: Roadmap, kind: str, paths: int, *, waypoints: int = 200,
         raise UnknownNameError("kind of path", kind, KINDS)
     if paths < 1 or waypoints < 2:
         raise ParameterError("paths and waypoints", (paths, waypoints), "1 or more paths of 2 or more waypoints")
-    generator = torch.Generator().manual_seed(check_seed(seed) + KINDS.index(kind))
+    # no seed of one kind gives the draws of another one; a generator takes 64 bits
+    generator = torch.Generator().manual_seed((check_seed(seed) * len(KINDS) + KINDS.index(kind)) % (1 << 64))
     found: list[Tensor] = []
     for _ in range(_MOST_DRAWS):
         if kind in CLOSED:
@@ -76,7 +77,7 @@ def read_paths(path: str | os.PathLike[str], width: int) -> dict[str, Tensor]:
         UnknownNameError: An array is of no known kind.
     """
     if not Path(path).is_file():
-        raise FileFormatError(path, "is not a file")
+        raise FileFormatError(path, "is not a regular file" if Path(path).exists() else "does not exist")
     try:
         with np.load(path, allow_pickle=False) as file:
             if not isinstance(file, Mapping) or not len(file):

@@ -107,8 +107,9 @@ def measure_roadmaps(
     results: list[Result] = []
     for index, (name, task, method) in enumerate(jobs):
         progress(f"{name} {task}, {method}", index, len(jobs))
-        options: dict[str, Any] = {"seeds": "auto" if method == "auto" else None, "samples": samples, "seed": seed}
-        options["method"] = "random" if method == "random" else "expansion"
+        options: dict[str, Any] = {"seed": seed, "seeds": "auto" if method == "auto" else None}
+        if method == "random":
+            options |= {"method": "random", "samples": samples}
         robot = load_robot(name)
         pairs: list[tuple[Roadmap, Roadmap]] = []
         for _ in range(1 if method == "random" else repeats):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -87,10 +87,11 @@ def run_teleoperation(
     seed: int = 0,
     progress: Progress = silent,
 ) -> list[Run]:
-    """Lets every method follow the same paths from the same starts (Section V-D of the paper).
+    """Lets every method follow the same paths (Section V-D of the paper).
 
     All start at the roadmap's configuration for the first waypoint, or at the nearest resolved vertex where it has
-    none. A joint moves at most 0.04 rad a step. After the last waypoint arms have 100 more steps to arrive.
+    none; "random" at those of its own roadmap. A joint moves at most 0.04 rad a step. After the last waypoint arms have
+    100 more steps to arrive.
 
     Args:
         roadmap: The roadmap of the method "expansion"; the others use its robot, task and graph.
@@ -118,9 +119,10 @@ def run_teleoperation(
             raise ParameterError(f"paths '{kind}'", tuple(waypoints.shape), f"(paths, 2 or more, {roadmap.task.width})")
     runs: list[Run] = []
     for method in methods:
-        controller = _controller(method, roadmap, seed, progress)
+        own = _random_roadmap(roadmap, seed, progress) if method == "random" else roadmap
+        controller = _controller(method, own)
         for kind, waypoints in paths.items():
-            trajectories, seconds = _follow(controller, roadmap, waypoints, f"{method}, {kind}", progress)
+            trajectories, seconds = _follow(controller, own, waypoints, f"{method}, {kind}", progress)
             figures = measure(roadmap, waypoints, trajectories, RATE, closed=kind in CLOSED)
             runs.append(Run(method, kind, waypoints, trajectories, seconds, figures))
     return runs
@@ -137,24 +139,18 @@ def check_methods(methods: Sequence[str]) -> None:
             raise UnknownNameError("method", method, METHODS)
 
 
-def _controller(method: str, roadmap: Roadmap, seed: int, progress: Progress) -> Controller:
-    makers: dict[str, Callable[[], Controller]] = {
-        "expansion": lambda: _OnRoadmap(roadmap),
-        "random": lambda: _OnRoadmap(
-            build(
-                roadmap.robot,
-                roadmap.task,
-                points=roadmap.graph,
-                method="random",
-                refine=False,
-                seed=seed,
-                progress=progress,
-            )
-        ),
-        "newton": lambda: NewtonIk(roadmap.robot, roadmap.task, max_step=MAX_STEP),
-        "relaxed": lambda: RelaxedIk(roadmap.robot, roadmap.task, max_step=MAX_STEP),
-    }
-    return makers[method]()
+def _random_roadmap(roadmap: Roadmap, seed: int, progress: Progress) -> Roadmap:
+    """Random-GRR's map of the same robot, task and graph."""
+    graph = roadmap.graph
+    return build(roadmap.robot, roadmap.task, points=graph, method="random", refine=False, seed=seed, progress=progress)
+
+
+def _controller(method: str, roadmap: Roadmap) -> Controller:
+    if method == "newton":
+        return NewtonIk(roadmap.robot, roadmap.task, max_step=MAX_STEP)
+    if method == "relaxed":
+        return RelaxedIk(roadmap.robot, roadmap.task, max_step=MAX_STEP)
+    return _OnRoadmap(roadmap)
 
 
 def starts(roadmap: Roadmap, points: Tensor) -> Tensor:

@@ -109,26 +109,32 @@ class Planner:
         options = {name: check_option(name, value) for name, value in entry.items()}
         if options.get("robot") is None:
             raise ParameterError("robot", "nothing", "a bundled robot or the path of a URDF")
-        options = self._with_contents({name: value for name, value in options.items() if value is not None})
+        options = self._with_paths({name: value for name, value in options.items() if value is not None})
         robot = self._robot(options)
+        if "seeds" in options:
+            options["seeds"] = self._seeds(options["seeds"], robot)
         task = make_order_task(robot, options)
         defaults = {name: option.default for name, option in known_options().items() if option.owner == "build"}
         check_options(robot, task, defaults | of_owner("build", options))
         return Order(_digest(robot, task, options), robot.name, task.kind, _orientation(task), options, needs)
 
-    def _with_contents(self, options: dict[str, Any]) -> dict[str, Any]:
-        """Options with absolute paths, and with seeds in place of their file."""
+    def _with_paths(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Options with absolute paths."""
         for name in ("robot", "spheres"):
             place = self.folder / str(options.get(name, ""))
             if name in options and (place.is_file() or place.suffix):
                 options[name] = str(place.resolve())
         if "package_dirs" in options:
             options["package_dirs"] = [str((self.folder / path).resolve()) for path in options["package_dirs"]]
-        if isinstance(options.get("seeds"), str) and options["seeds"] != "auto":
-            if not Path(options["seeds"]).suffix:
-                raise ParameterError("seeds", repr(options["seeds"]), "auto, a .csv, .txt or .npy file, or a table")
-            options["seeds"] = read_seeds(self.folder / options["seeds"]).tolist()
         return options
+
+    def _seeds(self, seeds: Any, robot: Robot) -> Any:
+        """Seeds as they are, or in place of their file."""
+        if not isinstance(seeds, str) or seeds == "auto":
+            return seeds
+        if not Path(seeds).suffix:
+            raise ParameterError("seeds", repr(seeds), "auto, a .csv, .txt, .npy or .parquet file, or a table")
+        return read_seeds(self.folder / seeds, robot.joint_names).tolist()
 
     def _robot(self, options: Mapping[str, Any]) -> Robot:
         # the device is the worker's affair: this machine may have none such

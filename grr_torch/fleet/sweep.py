@@ -62,7 +62,7 @@ def read_sweep(path: str | os.PathLike[str]) -> tuple[Order, ...]:
 
 def _read_yaml(path: Path) -> Any:
     if not path.is_file():
-        raise FileFormatError(path, "is not a file")
+        raise FileFormatError(path, "is not a regular file" if path.exists() else "does not exist")
     try:
         return yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)  # a safe loader
     except OSError as error:

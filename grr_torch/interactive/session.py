@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 
@@ -118,11 +119,10 @@ class Session:
             self.teleoperator.reset()
         target = self._target
         start = time.perf_counter()
-        if self._engaged:
-            command = self.teleoperator.step(torch.tensor(target, dtype=torch.float64))
-            q, status = command.configuration, str(command.status)
-        else:
-            q, status = self.configuration, "holding"
+        # without a target to follow the arm holds, but one that has acceleration limits comes to rest first
+        followed = torch.tensor(target if self._engaged else [math.nan] * len(target), dtype=torch.float64)
+        command = self.teleoperator.step(followed)
+        q, status = command.configuration, str(command.status)
         seconds = time.perf_counter() - start
         tool, clearance = tool_and_clearance(self.roadmap, q)
         self.tool = tuple(tool.tolist())

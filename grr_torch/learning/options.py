@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from grr_torch.errors import ParameterError, check_seed
+from grr_torch.errors import ParameterError, check_seed, check_whole
 from grr_torch.learning.network import Architecture
 from grr_torch.learning.split import Split
 
@@ -41,9 +41,7 @@ class TrainingOptions:
 
     def __post_init__(self) -> None:
         for name in ("samples", "epochs", "batch", "patience"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ParameterError(name, value, "a whole number, 1 or more")
+            object.__setattr__(self, name, check_whole(name, getattr(self, name), 1))
         if not 0.0 < self.learning_rate < math.inf:
             raise ParameterError("learning rate", self.learning_rate, "above 0 and finite")
         for name in ("joint_weight", "pose_weight"):
@@ -51,7 +49,7 @@ class TrainingOptions:
                 raise ParameterError(name.replace("_", " "), getattr(self, name), "0 or more and finite")
         if self.joint_weight == self.pose_weight == 0.0:
             raise ParameterError("joint weight and pose weight", "both 0", "at least one of them above 0")
-        check_seed(self.seed)
+        object.__setattr__(self, "seed", check_seed(self.seed))
 
     def parted(self) -> Split:
         """The split that is meant."""

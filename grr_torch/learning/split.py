@@ -55,7 +55,7 @@ class Split:
             raise ParameterError("validation and test shares", (self.validation, self.test), "less than 1 together")
         if self.block is not None and not 0.0 < self.block < math.inf:
             raise ParameterError("block", self.block, "above 0, in metres")
-        check_seed(self.seed)
+        object.__setattr__(self, "seed", check_seed(self.seed))
 
     def of(self, roadmap: Roadmap) -> Splitter:
         """The parting of a roadmap's task space.

@@ -93,15 +93,17 @@ def _stop_at_limits(
 ) -> Array:
     """`stop_at_limits` for arrays."""
     kept = _clamped(moved, limits)
-    stopped = kept != moved
+    stopped, ends = kept != moved, kept
+    going = np.ones_like(stopped[0])
     for _ in range(len(q)):
-        held = np.where(stopped, kept - q, 0.0).astype(q.dtype)
+        held = np.where(stopped, ends - q, 0.0).astype(q.dtype)
         rest = error - (jacobian * held).sum(1)
         step = held + damped_least_squares_of_few(jacobian * ~stopped, rest, damping)
         moved = q + step * (LONGEST_STEP / np.maximum(np.abs(step).max(0), LONGEST_STEP))
-        kept = _clamped(moved, limits)
-        beyond = (kept != moved) & ~stopped
+        within = _clamped(moved, limits)
+        beyond = (within != moved) & ~stopped & going
+        kept, ends = np.where(going, within, kept), np.where(beyond, within, ends)
         if not beyond.any():
             break
-        stopped |= beyond
+        stopped, going = stopped | beyond, beyond.any(0)
     return kept

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import ParameterError, check_whole
 from grr_torch.pieces import are_few, one_thread, piece, slices
 from grr_torch.projection.few import project_few
 from grr_torch.projection.step import (
@@ -52,8 +52,7 @@ class Tolerances:
         for name in ("position", "rotation"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise ParameterError(f"{name} tolerance", getattr(self, name), "above 0")
-        if not isinstance(self.iterations, int) or self.iterations < 1:
-            raise ParameterError("iterations", self.iterations, "1 or more")
+        object.__setattr__(self, "iterations", check_whole("iterations", self.iterations, 1))
 
 
 DEFAULT_TOLERANCES = Tolerances()

@@ -81,9 +81,10 @@ def free_step(equations: Equations) -> Tensor:
 
 
 def stop_at_limits(limits: Limits, equations: Equations, moved: Tensor) -> Tensor:
-    """Configurations after a step in which joints that would leave their range stop at its end.
+    """Configurations after a step in which joints that would leave their range go to its end, and no farther.
 
-    The others make up for it: their step is solved for again, until no more of them would leave.
+    The others make up for it: their step is solved for again, until no more of them would leave. A step that is too
+    long then is shortened as a whole, as every step is.
 
     Args:
         limits: Of the joints.
@@ -92,17 +93,20 @@ def stop_at_limits(limits: Limits, equations: Equations, moved: Tensor) -> Tenso
     """
     _, q, jacobian, error, damping = equations
     kept = moved.clamp(*limits)
-    stopped = kept != moved
+    stopped, ends = kept != moved, kept
+    # what is settled stays, whatever else of the batch is not
+    going = torch.ones_like(stopped[0])
     for _ in range(len(q)):
-        held = torch.where(stopped, kept - q, 0.0)
+        held = torch.where(stopped, ends - q, 0.0)
         rest = error - (jacobian * held).sum(1)
         step = held + damped_least_squares(jacobian * ~stopped, rest, damping)
         moved = torch.addcmul(q, step, LONGEST_STEP / step.abs().amax(0).clamp_min(LONGEST_STEP))
-        kept = moved.clamp(*limits)
-        beyond = (kept != moved) & ~stopped
+        within = moved.clamp(*limits)
+        beyond = (within != moved) & ~stopped & going
+        kept, ends = torch.where(going, within, kept), torch.where(beyond, within, ends)
         if not bool(beyond.any()):
             break
-        stopped = stopped | beyond
+        stopped, going = stopped | beyond, beyond.any(0)
     return kept
 
 

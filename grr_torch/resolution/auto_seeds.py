@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError, check_seed
+from grr_torch.errors import check_seed, check_whole
 from grr_torch.processes import at_once
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import Tolerances, project_columns, tool_points
@@ -59,14 +59,13 @@ _MISSING = 40.0
 _SUSPECT = 3.0
 
 
-def check_candidates(candidates: int) -> None:
-    """Checks how many sets of seeds are to be compared.
+def check_candidates(candidates: int) -> int:
+    """How many sets of seeds are to be compared.
 
     Raises:
         ParameterError: It is out of its range.
     """
-    if isinstance(candidates, bool) or not isinstance(candidates, int) or not 1 <= candidates <= _MOST_CANDIDATES:
-        raise ParameterError("candidates", candidates, f"a whole number from 1 to {_MOST_CANDIDATES:,}")
+    return check_whole("candidates", candidates, 1, _MOST_CANDIDATES)
 
 
 def find_seeds(

@@ -22,6 +22,7 @@ from grr_torch.resolution.memory import require_memory
 from grr_torch.resolution.methods import Parts, Work, at_random, by_expansion
 from grr_torch.resolution.options import bounded, check_options, describe_build
 from grr_torch.resolution.problem import Problem, pose_problem
+from grr_torch.resolution.random_grr import SAMPLES
 from grr_torch.resolution.reachability import measure_reachability
 from grr_torch.resolution.refine import refine as refine_roadmap
 from grr_torch.resolution.roadmap import Roadmap
@@ -43,9 +44,9 @@ def build(
     seeds: SeedsLike | str | None = None,
     rotations: int | None = None,
     method: str = "expansion",
-    candidates: int = CANDIDATES,
+    candidates: int | None = None,
     neighbours: int | None = None,
-    samples: int = 100,
+    samples: int | None = None,
     refine: bool = True,
     objectives: Mapping[str, float] | None = None,
     max_slope: float | None = None,
@@ -70,11 +71,12 @@ def build(
         rotations: How many rotations the grid has beside its positions, where rotation varies: yaws on a ring,
             directions on the sphere, or orientations.
         seeds: (S, n) configurations that the expansion starts from, or "auto": they are found.
-        candidates: How many sets of seeds are compared, where they are found; more take longer and may do better.
+        candidates: How many sets of seeds are compared, where they are found, 60 by default; more take longer and may
+            do better.
         method: "expansion", or "random": random configurations at every vertex and a constraint solver.
         neighbours: How many of the nearest vertices are averaged over; 24 in the plane and 64 in space by default.
             Where rotation varies, the vertices up to so many edges away, 2 by default.
-        samples: Random configurations of a vertex, for the method "random".
+        samples: Random configurations of a vertex, for the method "random"; 100 by default.
         refine: Whether the roadmap is repaired, relaxed and certified after the expansion.
         objectives: Weights of "clearance", "manipulability" and "limits", which refinement serves besides smoothness;
             at weight 1, 1 % of an objective's mean is worth 1 % of smoothness.
@@ -116,7 +118,9 @@ def build(
         "seed": seed,
         "tolerances": asdict(tolerances),
     }
-    check_options(robot, problem.task, {**options, "seeds": seeds} if method == "random" else options)
+    given = {**options, "seeds": seeds if method == "random" else problem.seeds}
+    options |= check_options(robot, problem.task, given)
+    seed, reachability = options["seed"], options["reachability"]
     if resume and checkpoint is None:
         raise ParameterError("resume", "no checkpoint", "with checkpoint (--checkpoint DIR), the folder to go on from")
     what = None if checkpoint is None else describe_build(robot, problem, options)
@@ -126,7 +130,10 @@ def build(
         require_memory(robot, problem, refine)
         with kept.timed("building"):
             work = Work(robot, problem, seed, tolerances, check, progress, kept)
-            parts = at_random(work, samples) if method == "random" else by_expansion(work, neighbours, candidates)
+            if method == "random":
+                parts = at_random(work, options["samples"] or SAMPLES)
+            else:
+                parts = by_expansion(work, options["neighbours"], options["candidates"] or CANDIDATES)
         settings = {
             "margin": robot.margin,
             "seed": seed,

@@ -23,10 +23,10 @@ from grr_torch.spaces.configuration import difference
 _ROUNDS = 18
 # cells with less spread are not looked at [rad]
 _SUSPECT = 0.6
-# the spread that is aimed at, and beyond which a cell is given up [rad]: in a first attempt; in a second one, for maps
-# with more cells left between the limit and 1.1 rad than above, which may hold those; and in one for maps with only a
-# handful left, some of them just beyond what the first gives up
-_FIRST, _TIGHT, _WIDE = (0.93, 1.4), (0.96, 1.1), (0.93, 1.7)
+# the spread that is aimed at, and beyond which a cell is given up [rad]: in a first attempt; in a second one that goes
+# on from there, for maps with more cells left between the limit and 1.1 rad than above; and in one from the beginning,
+# for maps with only a handful left, some of them just beyond what the first gives up
+_FIRST, _TIGHT, _WIDE = (0.93, 1.4), (0.93, 1.1), (0.93, 1.7)
 _HANDFUL = 16
 # cells of maps that are attempted twice: it takes long
 _MOST_TWICE = 65536
@@ -65,33 +65,39 @@ def certify(
     looking, *stages = map(checkpoint.stage, names)
     robot, task, points = network.robot, network.task, network.targets.T
 
-    def attempt(aim: float, hopeless: float) -> tuple[Tensor, Tensor]:
+    def attempt(q: Tensor, spread: Tensor, aim: float, hopeless: float) -> tuple[Tensor, Tensor]:
+        """Configurations, and the spread of all cells (C,) then; of those below the limit, no less than it is."""
         again = (aim, hopeless) != _FIRST
         kept, looking_again = stages[2:] if again else stages[:2]
         # the time left is told as if there were no second attempt
         told = silent if again else progress
+        suspects = spread > _SUSPECT
         given = corners[suspects], spread[suspects], q, aim, hopeless
         moved = _drawn_together(network, *given, tolerances, told, kept)
         told("certifying", _ROUNDS, _ROUNDS)
         # cells that were not looked at may have suffered, where their corners have moved far enough
-        doubtful = ~(spread + _GROWTH * _way(network, corners, q, moved) <= LARGEST_SPREAD)
-        found = spreads(robot, task, points, moved.T, corners[doubtful], tolerances, told, looking_again)
-        return moved, found[found > LARGEST_SPREAD]
+        spread = spread + _GROWTH * _way(network, corners, q, moved)
+        doubtful = ~(spread <= LARGEST_SPREAD)
+        spread[doubtful] = spreads(robot, task, points, moved.T, corners[doubtful], tolerances, told, looking_again)
+        return moved, spread
+
+    def left(spread: Tensor) -> Tensor:
+        return spread[spread > LARGEST_SPREAD]
 
     with one_thread(), torch.no_grad():
         spread = spreads(robot, task, points, q.T, corners, tolerances, progress, looking)
-        best, left = q, spread[spread > LARGEST_SPREAD]
-        if len(left) == 0:
+        if len(left(spread)) == 0:
             return q
-        suspects = spread > _SUSPECT
-        moved, found = attempt(*_FIRST)
-        if len(found) < len(left):
-            best, left = moved, found
-        if (second := _second(left)) is not None and len(corners) <= _MOST_TWICE:
-            moved, found = attempt(*second)
-            if len(found) < len(left):
-                best = moved
-    return best
+        best, given = (q, spread), (q, spread)
+        found = attempt(*given, *_FIRST)
+        if len(left(found[1])) < len(left(spread)):
+            best = found
+        second = _second(left(best[1]))
+        if second is not None and len(corners) <= _MOST_TWICE:
+            found = attempt(*(best if second == _TIGHT else given), *second)
+            if len(left(found[1])) < len(left(best[1])):
+                best = found
+    return best[0]
 
 
 def _second(left: Tensor) -> tuple[float, float] | None:

@@ -110,8 +110,7 @@ def _led_round(
     angles = [2.0 * math.pi * k / _STATIONS for k in range(_STATIONS)]
     stations = torch.stack([_turned(task, points, axis, origin, angle) for angle in angles])
     stations = torch.cat([stations, stations], dim=1)
-    # in single precision: which seeds are found hangs on the last digits, and they were measured with these
-    turn = torch.tensor([2.0 * math.pi / _STATIONS, 0.0]).to(configurations).repeat_interleave(len(configurations))
+    turn = configurations.new_tensor([2.0 * math.pi / _STATIONS, 0.0]).repeat_interleave(len(configurations))
     q = torch.cat([configurations, configurations])
     found: list[Tensor] = []
     reached: list[Tensor] = []

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import ParameterError, check_whole
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, project_columns
 from grr_torch.resolution.checkpoint import UNKEPT, Stage
@@ -96,16 +96,16 @@ def expand(
     )
 
 
-def check_neighbours(task: TaskSpace, neighbours: int) -> None:
-    """Checks how many of the nearest vertices are to be averaged over, or how many edges away they may be.
+def check_neighbours(task: TaskSpace, neighbours: int) -> int:
+    """How many of the nearest vertices are to be averaged over, or how many edges away they may be.
 
     Raises:
         ParameterError: It is below 1, or above 3 where rotation varies.
     """
-    if neighbours < 1:
-        raise ParameterError("neighbours", neighbours, "1 or more")
-    if task.rotations is not None and neighbours > MOST_HOPS:
-        raise ParameterError("neighbours", neighbours, f"1 to {MOST_HOPS} edges, as rotation varies")
+    number = check_whole("neighbours", neighbours, 1)
+    if task.rotations is not None and number > MOST_HOPS:
+        raise ParameterError("neighbours", number, f"1 to {MOST_HOPS} edges, as rotation varies")
+    return number
 
 
 def grow(

@@ -50,7 +50,7 @@ def check_objectives(robot: Robot, objectives: Mapping[str, float] | None) -> di
         number = not isinstance(weight, bool) and isinstance(weight, int | float)
         if not number or not 0.0 <= weight < math.inf:
             raise ParameterError(f"weight of {name}", weight, "0 or more; at 0 the objective is only reported")
-        if name == "clearance" and not bool(robot.self_collision_distance(robot.sample(1)).isfinite().all()):
+        if name == "clearance" and robot.sphere_kernel is None:
             raise ParameterError("objective", name, f"a robot with a sphere model; {robot.name} has no pair of links")
         if name == "limits" and not bool(_limited(robot).any()):
             raise ParameterError("objective", name, f"a robot with joint limits; {robot.name} has none")
@@ -129,5 +129,5 @@ def _values(robot: Robot, task: TaskSpace, name: str, q: Tensor) -> Tensor:
 
 
 def _limited(robot: Robot) -> Tensor:
-    """(n,) joints with limits on both sides."""
-    return robot.lower.isfinite() & robot.upper.isfinite() & ~robot.continuous
+    """(n,) joints with limits on both sides, and room between them."""
+    return robot.lower.isfinite() & robot.upper.isfinite() & (robot.lower < robot.upper) & ~robot.continuous

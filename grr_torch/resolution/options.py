@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from grr_torch.errors import ParameterError, UnknownNameError, check_seed
+from grr_torch.errors import ParameterError, UnknownNameError, check_seed, check_whole
 from grr_torch.resolution.auto_seeds import check_candidates
 from grr_torch.resolution.checkpoint import digest
 from grr_torch.resolution.expand import check_neighbours
@@ -17,20 +17,21 @@ from grr_torch.resolution.problem import Problem
 from grr_torch.resolution.roadmap_file import robot_to_json
 from grr_torch.resolution.seeds import check_seeds
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.graph import check_bounds, check_count
+from grr_torch.spaces.graph import TaskGraph, check_bounds, check_count
 from grr_torch.spaces.product import rotating
 from grr_torch.spaces.rotations import check_rotations
 from grr_torch.spaces.task import TaskSpace
 from grr_torch.tensor_file import tensor_hash
 from grr_torch.version import __version__
 
-METHODS = ("expansion", "random")
+# each method, and which arguments are none of it
+METHODS = {"expansion": ("samples",), "random": ("seeds", "neighbours", "candidates")}
 # of what stages keep, and of how they come to it
-CHECKPOINT_VERSION = 8
+CHECKPOINT_VERSION = 9
 _MOST_STARTS = 100_000
 
 
-def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> None:
+def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> dict[str, int]:
     """Checks what `build` is asked for, as far as no grid has to be laid for it.
 
     Args:
@@ -39,38 +40,44 @@ def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> 
         options: Arguments of `build` by their names; of the problem's (points, bounds, rotations, seeds), those there
             are.
 
+    Returns:
+        The whole numbers that are given, as such: numpy's are none that JSON knows.
+
     Raises:
         ParameterError: A parameter is out of its range, or does not go with another.
         UnknownNameError: No such method or objective.
         SeedError: Seeds are given, and none can be used.
     """
-    check_seed(options["seed"])
+    numbers = {"seed": check_seed(options["seed"])}
     objectives, reachability, method = (options[name] for name in ("objectives", "reachability", "method"))
     check_objectives(robot, objectives)
     if objectives and not options["refine"]:
         raise ParameterError("objectives", tuple(objectives), "none without refinement, which serves them")
-    if not 0 <= reachability <= _MOST_STARTS:
-        raise ParameterError("reachability", reachability, f"0 to {_MOST_STARTS:,} random starts a vertex")
+    numbers["reachability"] = check_whole("reachability", reachability, 0, _MOST_STARTS)
     max_slope = options["max_slope"]
     if max_slope is not None and not max_slope > 0.0:
         raise ParameterError("max_slope", max_slope, "above 0, in rad/m; inf: no bound")
     if method not in METHODS:
-        raise UnknownNameError("method", method, METHODS)
-    if method == "random" and options.get("seeds") is not None:
-        given = options["seeds"]
-        raise ParameterError(
-            "seeds", given if isinstance(given, str) else "some", 'none with method "random", which grows from no seeds'
-        )
-    check_candidates(options["candidates"])
-    if options["samples"] < 1:
-        raise ParameterError("samples", options["samples"], "1 or more")
+        raise UnknownNameError("method", method, tuple(METHODS))
+    for name in METHODS[method]:
+        if (given := options.get(name)) is not None:
+            told = given if isinstance(given, str | int) else "some"
+            raise ParameterError(name, told, f'none with method "{method}"')
+    seeds, candidates = options.get("seeds"), options["candidates"]
+    if candidates is not None:
+        if seeds is not None and not isinstance(seeds, str):
+            raise ParameterError("candidates", candidates, 'none with seeds that are given; they are for seeds "auto"')
+        numbers["candidates"] = check_candidates(candidates)
+    if options["samples"] is not None:
+        numbers["samples"] = check_whole("samples", options["samples"], 1)
     if options["neighbours"] is not None:
-        check_neighbours(task, options["neighbours"])
+        numbers["neighbours"] = check_neighbours(task, options["neighbours"])
     _check_problem(robot, task, *(options.get(name) for name in ("points", "bounds", "rotations", "seeds")))
+    return numbers
 
 
 def _check_problem(robot: Robot, task: TaskSpace, points: Any, bounds: Any, rotations: Any, seeds: Any) -> None:
-    if isinstance(points, int):
+    if points is not None and not isinstance(points, TaskGraph):
         check_count(points)
     if bounds is not None:
         check_bounds(bounds)

@@ -122,13 +122,19 @@ def check_task(robot: Robot, task: TaskSpace) -> None:
     """Checks that a robot can be asked for this task.
 
     Raises:
-        ParameterError: An SE(2) task for a robot that leaves the plane, or a task in space for one that does not.
+        ParameterError: The task takes more joints than there are, it is in SE(2) and the robot leaves the plane, or it
+            is in space and the robot does not.
     """
     given = f"{task.kind} in {task.name}"
     if task.dimension == 2 and task.constraints > 2 and not stays_upright(robot):
         raise ParameterError("task", given, f"SE(3) for {robot.name}, whose tool leaves the plane")
     if task.dimension == 3 and stays_in_plane(robot):
         raise ParameterError("task", given, f"two axes for {robot.name}, whose tool stays in a plane")
+    if robot.n < 2:
+        raise ParameterError("robot", f"{robot.name}, which has 1 joint", "one with 2 joints or more")
+    if robot.n < task.constraints:
+        asked = f"{given}, which fixes {task.constraints} coordinates"
+        raise ParameterError("task", asked, f"one that fixes no more than {robot.name} has joints, {robot.n}")
 
 
 def _check_reach(robot: Robot, task: TaskSpace, graph: TaskGraph, *, warn: bool) -> None:
@@ -161,6 +167,9 @@ def _complete(
     problem = preset.problems.get(kind or "") if preset else None
     if isinstance(task, str) and preset and problem is None and bounds is None:
         raise UnknownNameError("task", task, tuple(preset.problems))
+    for name, given, kind_of in (("bounds", bounds, TaskGraph), ("rotations", rotations, ProductGraph)):
+        if given is not None and isinstance(points, kind_of):
+            raise ParameterError(name, given, f"none with a graph given as points, which has its own {name}")
     graph = points if isinstance(points, TaskGraph) else _grid(robot, task, points, bounds, problem)
     if seeds is None:
         seeds = "auto" if problem is None else problem.seeds

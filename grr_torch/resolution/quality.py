@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from torch import Tensor
 
 from grr_torch.progress import Progress, silent
@@ -94,7 +95,8 @@ def measure_quality(roadmap: Roadmap, progress: Progress = silent) -> Quality:
     reached = None if reachable is None else int(reachable.sum())
     connected = int(roadmap.connected.sum())
     slopes = edge_slopes(roadmap)
-    levels = slopes.quantile(slopes.new_tensor([0.5, 0.99, 1.0])).tolist() if len(slopes) else [None] * 3
+    # torch's quantile takes no more than 2²⁴ values
+    levels = np.quantile(slopes.numpy(), [0.5, 0.99, 1.0]).tolist() if len(slopes) else [None] * 3
     position_error, rotation_error = _residuals(roadmap)
     q = roadmap.configurations[resolved]
     return Quality(

@@ -25,6 +25,8 @@ from grr_torch.spaces.configuration import difference
 from grr_torch.spaces.graph import TaskGraph
 from grr_torch.spaces.task import TaskSpace
 
+# configurations of a vertex, unless told otherwise
+SAMPLES = 100
 # random starts of a vertex in a round, and rounds in all; a vertex that none of the first reached is left out
 _STARTS = 40
 _ROUNDS = 12
@@ -62,7 +64,7 @@ def random_grr(
     task: TaskSpace,
     graph: TaskGraph,
     *,
-    samples: int = 100,
+    samples: int = SAMPLES,
     nearest: int | None = None,
     seed: int = 0,
     tolerances: Tolerances = DEFAULT_TOLERANCES,

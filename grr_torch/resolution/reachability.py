@@ -96,6 +96,9 @@ def within_reach(robot: Robot, task: TaskSpace, points: Tensor) -> Tensor:
     # frames are stored with their axes as rows
     mount = tree.links[tree.tool][1].cpu().to(points)
     hand = mount[:3, :3] @ mount[3, :3]
+    if d == 2 and bool((_some_poses(robot)[1][:, 2, 2] < 0.0).all()):
+        # of a tool that points down, a yaw is what is left of a rotation that turns it over
+        hand = hand * hand.new_tensor([1.0, -1.0, -1.0])
     wrist = points[:, :d] - torch.einsum("ijN,j->Ni", turned, hand)[:, :d]
     return inside & ((wrist - centre[:d]).norm(dim=1) <= radius - float(hand.norm()) + 1e-6)
 
@@ -155,7 +158,7 @@ def reach_box(robot: Robot, axes: int) -> list[tuple[float, float]]:
     for _ in range(_VARIATIONS):
         farthest = torch.cat([side.topk(_FARTHEST, dim=0).indices for side in (places, -places)]).flatten()
         parents = q[farthest].repeat(_VARIED, 1)
-        redrawn = torch.rand(parents.shape, generator=generator).to(q.device) < 1.0 / robot.n
+        redrawn = torch.rand(parents.shape, dtype=q.dtype, generator=generator).to(q.device) < 1.0 / robot.n
         children = torch.where(redrawn, robot.sample(len(parents), generator), parents)
         q = torch.cat([q[farthest], children])
         places = robot.forward_kinematics(q)[0][:, :axes]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from grr_torch.progress import Progress
 from grr_torch.resolution.checkpoint import Checkpoint
 from grr_torch.resolution.objectives import OBJECTIVES
@@ -33,7 +35,8 @@ def before_refinement(roadmap: Roadmap, progress: Progress, checkpoint: Checkpoi
     """The figures of a roadmap that `parameters["refinement"]` keeps; by name, as in `Quality`."""
     slopes = edge_slopes(roadmap)
     figures: list[int | float | None] = [int(roadmap.resolved.sum()), int(roadmap.connected.sum())]
-    levels = [slopes.mean(), slopes.quantile(0.99), slopes.max()] if len(slopes) else []
+    # torch's quantile takes no more than 2²⁴ values
+    levels = [slopes.mean(), np.quantile(slopes.numpy(), 0.99), slopes.max()] if len(slopes) else []
     figures += [float(level) for level in levels] or [None] * 3
     figures.append(len(steep_edges(roadmap)))
     triangles = roadmap.triangles(progress, checkpoint.stage("triangles"))

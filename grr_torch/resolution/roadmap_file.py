@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -183,9 +183,10 @@ def robot_to_json(robot: Robot) -> dict[str, Any]:
 
 
 def _robot_from_json(data: dict[str, Any], device: torch.device) -> Robot:
-    directory = data["urdf_directory"]
+    directory, preset = data["urdf_directory"], None
     if data["bundled"] and data["name"] in robot_names():
-        directory = load_preset(data["name"]).urdf.parent
+        preset = load_preset(data["name"])
+        directory = preset.urdf.parent
     urdf = urdf_from_json(
         data["parsed"],
         text=data["urdf"],
@@ -193,7 +194,7 @@ def _robot_from_json(data: dict[str, Any], device: torch.device) -> Robot:
         package_dirs=data["package_dirs"],
     )
     spheres = data["spheres"]
-    return make_robot(
+    robot = make_robot(
         urdf,
         name=data["name"],
         base=data["base"],
@@ -204,6 +205,7 @@ def _robot_from_json(data: dict[str, Any], device: torch.device) -> Robot:
         device=device,
         dtype=torch.float32 if data["dtype"] == "float32" else torch.float64,
     )
+    return replace(robot, preset=preset)
 
 
 def _check_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> None:

@@ -7,20 +7,19 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from grr_torch.errors import FileFormatError, GrrWarning, SeedError
+from grr_torch.errors import GrrWarning, SeedError
 from grr_torch.projection.project import Tolerances, project_columns, tool_points
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import TaskGraph
 from grr_torch.spaces.task import TaskSpace
+from grr_torch.tables import read_rows
 
 # vertices near its tool that a seed is projected to
 _TRIED = 8
@@ -28,28 +27,17 @@ _TRIED = 8
 SeedsLike = Tensor | np.ndarray[Any, Any] | Sequence[Sequence[float]]
 
 
-def read_seeds(path: str | os.PathLike[str]) -> Tensor:
-    """Reads seeds from a file: one configuration a line, commas or blanks between values (.csv, .txt), or .npy.
+def read_seeds(path: str | os.PathLike[str], joint_names: Sequence[str] | None = None) -> Tensor:
+    """Reads seeds (S, n) from a file, one configuration a row: .npy, .parquet, or else text (.csv, .txt).
+
+    Args:
+        path: The file; see `grr_torch.tables.read_rows`.
+        joint_names: Names of columns that may be in any order; None: columns have no names.
 
     Raises:
-        FileFormatError: It is missing or does not hold a table of numbers.
+        FileFormatError: It is missing, does not hold a table of finite numbers, or has other columns.
     """
-    path = Path(path)
-    try:
-        if path.suffix == ".npy":
-            table = np.load(path, allow_pickle=False)
-        else:
-            lines = [line.split("#")[0].strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
-            rows = [line.split(",") if "," in line else line.split() for line in lines]
-            table = np.array([[float(value) for value in row] for row in rows if row], dtype=np.float64)
-    except OSError as error:
-        raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except (ValueError, EOFError, MemoryError, TokenError, BadZipFile) as error:
-        reason = "is not a table of numbers with rows of one length, and no header"
-        raise FileFormatError(path, reason) from error
-    if not isinstance(table, np.ndarray) or table.ndim != 2 or table.size == 0 or table.dtype.kind not in "fi":
-        raise FileFormatError(path, "is not a table of numbers with one seed a row")
-    return torch.from_numpy(table.astype(np.float64))
+    return torch.from_numpy(np.concatenate(list(read_rows(Path(path), joint_names, "seeds"))))
 
 
 def check_seeds(robot: Robot, seeds: SeedsLike) -> Tensor:

@@ -82,7 +82,7 @@ def fit_spheres(
         raise ParameterError("spheres", count, "1 to 1000 a link")
     if tolerance is not None and not 1e-4 <= tolerance < np.inf:
         raise ParameterError("tolerance", tolerance, "0.0001 m or more")
-    check_seed(seed)
+    seed = check_seed(seed)
     if not 0 <= starts <= 100:
         raise ParameterError("starts", starts, "0 to 100")
     links = [link for link, shapes in urdf.collisions.items() if shapes]

@@ -99,6 +99,8 @@ def make_robot(
     dtype: torch.dtype,
 ) -> Robot:
     """Makes a `Robot` from a validated URDF; see `load_robot`."""
+    if spheres is not None:
+        spheres.check_links(urdf.links)
     held = _held(urdf, held_joints)
     path = urdf.path(base, tool)
     _check_types(urdf, path)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from grr_torch.errors import GrrWarning, UrdfError
+from grr_torch.robots.check_xml import check_xml
 from grr_torch.robots.urdf import MOVABLE_TYPES, Joint, Shape, Urdf
 
 # metres beyond which an origin is a mistake
@@ -88,6 +89,7 @@ def _parse(data: bytes, source: str) -> tuple[Any, str]:
         raise UrdfError(source, f"is not a URDF: its root element is <{root.tag}>, not <robot>")
     if "name" not in root.attrib:
         raise UrdfError(source, "<robot> has no name")
+    check_xml(root, source)
     try:
         urdf = yourdfpy.URDF.load(BytesIO(etree.tostring(root)), build_scene_graph=False, load_meshes=False)
     except (KeyError, ValueError, AttributeError, IndexError, TypeError) as error:
@@ -216,8 +218,6 @@ def _shapes(parsed: Sequence[Any], link: str, source: str) -> tuple[Shape, ...]:
     shapes: list[Shape] = []
     for item in parsed:
         geometry = item.geometry
-        if geometry is None:
-            raise UrdfError(source, f"link '{link}' has a shape without <geometry>")
         if geometry.box is not None:
             kind, size = "box", tuple(map(float, geometry.box.size))
         elif geometry.cylinder is not None:
@@ -226,8 +226,6 @@ def _shapes(parsed: Sequence[Any], link: str, source: str) -> tuple[Shape, ...]:
             kind, size = "sphere", (geometry.sphere.radius,)
         else:
             kind, size = "mesh", _scale(geometry.mesh.scale)
-            if not geometry.mesh.filename:
-                raise UrdfError(source, f"link '{link}' has a <mesh> without a filename")
         wanted = {"box": 3, "cylinder": 2, "sphere": 1, "mesh": 3}[kind]
         if len(size) != wanted or not all(
             math.isfinite(value) and (value > 0.0 or (kind == "mesh" and value < 0.0)) for value in size

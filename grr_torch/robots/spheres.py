@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -10,8 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from grr_torch.errors import FileFormatError, UnknownNameError
+from grr_torch.errors import FileFormatError, ParameterError, UnknownNameError
 from grr_torch.output import atomic_write
+
+# what YAML 1.1 takes for a truth value, or none
+_NOT_TEXT = ("y", "yes", "n", "no", "true", "false", "on", "off", "null")
 
 
 @dataclass(frozen=True)
@@ -33,11 +37,27 @@ class SphereModel:
 
     Attributes:
         spheres: Spheres by link.
-        ignored: Pairs of links that are not checked, each in alphabetical order.
+        ignored: Pairs of links that are not checked; each is put in alphabetical order.
     """
 
     spheres: Mapping[str, tuple[Sphere, ...]]
     ignored: frozenset[tuple[str, str]]
+
+    def __post_init__(self) -> None:
+        pairs = [tuple(pair) for pair in self.ignored if not isinstance(pair, str)]
+        if len(pairs) < len(self.ignored) or any(len(pair) != 2 for pair in pairs):
+            raise ParameterError("ignored", self.ignored, "pairs of links")
+        object.__setattr__(self, "ignored", frozenset(ordered_pair(*pair) for pair in pairs))
+
+    def check_links(self, links: Sequence[str]) -> None:
+        """Looks up all links that are named.
+
+        Raises:
+            UnknownNameError: One is not among a robot's links.
+        """
+        for link in (*self.spheres, *itertools.chain(*sorted(self.ignored))):
+            if link not in links:
+                raise UnknownNameError("link", link, links, " (named by the sphere model)")
 
     @property
     def checked(self) -> list[tuple[str, str]]:
@@ -103,7 +123,7 @@ class SphereModel:
         ignore = data.get("self_collision_ignore") or {}
         if not isinstance(ignore, dict) or not all(isinstance(v, list) for v in ignore.values()):
             raise FileFormatError(source, "'self_collision_ignore' must map a link to a list of links")
-        ignored = {ordered_pair(_link(a, links), _link(b, links)) for a, others in ignore.items() for b in others}
+        ignored = {(_link(a, links), _link(b, links)) for a, others in ignore.items() for b in others}
         return SphereModel(spheres, frozenset(ignored))
 
 
@@ -119,7 +139,8 @@ def _number(value: float) -> str:
 
 
 def _quoted(name: str) -> str:
-    return name if name.replace("_", "").isalnum() and not name[0].isdigit() else f'"{name}"'
+    plain = name.replace("_", "").isalnum() and not name[0].isdigit() and name.lower() not in _NOT_TEXT
+    return name if plain else json.dumps(name, ensure_ascii=False)
 
 
 def _link(name: Any, links: Sequence[str]) -> str:

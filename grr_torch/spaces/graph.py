@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import ParameterError, check_whole
 from grr_torch.spaces.cliques import closed, triangles
 from grr_torch.spaces.lattice import Lattice
 
@@ -51,6 +51,8 @@ class TaskGraph:
             raise ParameterError("edges of a graph", shape, f"torch.int64 of shape (E, 2), from 0 to {len(points) - 1}")
         if not bool((edges[:, 0] < edges[:, 1]).all()):
             raise ParameterError("edges of a graph", "one whose first vertex is not the smaller one", "pairs a < b")
+        if _some_repeat(edges.numpy(), len(points)):
+            raise ParameterError("edges of a graph", "one that is there twice", "pairs that differ")
         if self.lattice is None and _some_coincide(points.numpy()):
             raise ParameterError("points of a graph", "two that coincide", "points that differ")
 
@@ -116,10 +118,20 @@ class TaskGraph:
         return closed(corners, self.edges[kept], len(self.points))
 
     def edge_between(self, first: Tensor, second: Tensor) -> Tensor:
-        """Indices (K,) of the edges that join vertices (K,) to others (K,)."""
+        """Indices (K,) of the edges that join vertices (K,) to others (K,).
+
+        Raises:
+            ParameterError: Two of them are not joined.
+        """
         keys, order = self._sorted_keys
         pairs = torch.stack([first, second], dim=1).sort(dim=1).values
-        return order[torch.searchsorted(keys, pairs[:, 0] * len(self.points) + pairs[:, 1])]
+        wanted = pairs[:, 0] * len(self.points) + pairs[:, 1]
+        places = torch.searchsorted(keys, wanted)
+        found = torch.searchsorted(keys, wanted, right=True) > places
+        if not bool(found.all()):
+            wrong = tuple(pairs[~found][0].tolist())
+            raise ParameterError("vertices", wrong, "two that an edge joins")
+        return order[places]
 
     @cached_property
     def _sorted_keys(self) -> tuple[Tensor, Tensor]:
@@ -159,6 +171,13 @@ def _some_coincide(points: np.ndarray) -> bool:
     return bool((ordered[1:] == ordered[:-1]).all(1).any())
 
 
+def _some_repeat(edges: np.ndarray, count: int) -> bool:
+    keys = edges[:, 0] * count + edges[:, 1]
+    # a grid's edges come in a few sorted runs, which this kind of sort merges
+    keys.sort(kind="stable")
+    return bool((keys[1:] == keys[:-1]).any())
+
+
 def check_bounds(bounds: Bounds) -> tuple[tuple[float, float], ...]:
     """Bounds as pairs of floats.
 
@@ -179,11 +198,9 @@ def check_count(points: int) -> int:
     """The number of vertices asked for.
 
     Raises:
-        ParameterError: It is below 1 or beyond what could be held.
+        ParameterError: It is no whole number, below 1 or beyond what could be held.
     """
-    if isinstance(points, bool) or not hasattr(points, "__index__") or not 1 <= points <= MOST_POINTS:
-        raise ParameterError("points", points, f"a whole number from 1 to {MOST_POINTS:,}")
-    return int(points)
+    return check_whole("points", points, 1, MOST_POINTS)
 
 
 def staggered_grid(bounds: Bounds, n: int) -> TaskGraph:
@@ -245,8 +262,9 @@ def random_graph(bounds: Bounds, n: int, *, k: int, generator: torch.Generator |
         ParameterError: The bounds are empty, or n or k is not valid.
     """
     pairs, n = check_bounds(bounds), check_count(n)
-    if not 1 <= k < n:
-        raise ParameterError("k", k, f"1 to {n - 1}: each point is joined to others")
+    if n == 1:
+        raise ParameterError("points", n, "2 or more, each of which is joined to others")
+    k = check_whole("k", k, 1, n - 1)
     low, high = torch.tensor(pairs, dtype=torch.float64).T
     points = low + (high - low) * torch.rand(n, len(pairs), dtype=torch.float64, generator=generator)
     indices = TaskGraph(points, torch.empty(0, 2, dtype=torch.long)).neighbours(torch.arange(n), k)[0]

@@ -18,24 +18,28 @@ from grr_torch.spaces.lattice import Lattice
 _AT_CENTRE = 1e-12
 
 
-def pyramid_corners(lattice: Lattice) -> Tensor:
-    """(P, K) vertices of all pyramids: the corners of the face, the last axis fastest, and behind them the centre.
+def pyramid_corners(lattice: Lattice, pyramids: Tensor | None = None) -> Tensor:
+    """(P, K) vertices of pyramids (P,): the corners of the face, the last axis fastest, and behind them the centre.
 
-    K is 3 in the plane and 5 in space.
+    K is 3 in the plane and 5 in space. By default, of all pyramids.
     """
-    d = len(lattice.cells)
-    corner = torch.arange(math.prod(count + 1 for count in lattice.cells))
-    corner = corner.reshape([count + 1 for count in lattice.cells])
-    centre = len(corner.flatten()) + torch.arange(math.prod(lattice.cells))
-    pyramids: list[Tensor] = []
-    for axis, upper in itertools.product(range(d), (0, 1)):
-        face: list[Tensor] = []
-        for shift in itertools.product((0, 1), repeat=d - 1):
-            shifts = (*shift[:axis], upper, *shift[axis:])
-            window = tuple(slice(s, s + count) for s, count in zip(shifts, lattice.cells, strict=True))
-            face.append(corner[window].flatten())
-        pyramids.append(torch.stack([*face, centre], dim=1))
-    return torch.stack(pyramids, dim=1).flatten(0, 1)
+    d, corners = len(lattice.cells), math.prod(count + 1 for count in lattice.cells)
+    if pyramids is None:
+        pyramids = torch.arange(2 * d * math.prod(lattice.cells))
+    cell, axis, upper = pyramids // (2 * d), pyramids % (2 * d) // 2, pyramids % 2
+    first, rest, strides, stride = torch.zeros_like(cell), cell, [0] * d, 1
+    for k in range(d - 1, -1, -1):
+        strides[k] = stride
+        first += rest % lattice.cells[k] * stride
+        rest, stride = rest // lattice.cells[k], stride * (lattice.cells[k] + 1)
+    shifts = torch.tensor(
+        [
+            [sum(s * step for s, step in zip(shift, strides[:k] + strides[k + 1 :], strict=True)) for k in range(d)]
+            for shift in itertools.product((0, 1), repeat=d - 1)
+        ]
+    )
+    first = first + upper * torch.tensor(strides)[axis]
+    return torch.cat([first[:, None] + shifts.T[axis], corners + cell[:, None]], dim=1)
 
 
 def pyramid_weights(lattice: Lattice, offsets: Tensor, pyramids: Tensor) -> Tensor:

@@ -133,8 +133,8 @@ def make_task(
         raise ParameterError("rotation", tuple(rpy), f"none for the task '{kind}', which leaves it free")
     if axis is not None and kind not in (Axis.kind, Yaw.kind):
         raise ParameterError("axis", tuple(axis), f"none for the task '{kind}', which has none")
-    angles = _three("rotation", rpy or (0.0, 0.0, 0.0), "three finite angles: roll, pitch, yaw [rad]")
-    vector = _three("axis", axis or (0.0, 0.0, 1.0), "three finite numbers that are not all zero")
+    angles = _three("rotation", (0.0, 0.0, 0.0) if rpy is None else rpy, "three finite angles: roll, pitch, yaw [rad]")
+    vector = _three("axis", (0.0, 0.0, 1.0) if axis is None else axis, "three finite numbers that are not all zero")
     if kind == Position.kind:
         return Position(dimension)
     if kind == FixedRotation.kind:
@@ -145,9 +145,11 @@ def make_task(
 
 
 def _three(name: str, values: Sequence[float], valid: str) -> tuple[float, float, float]:
-    if len(values) != 3:
-        raise ParameterError(name, tuple(values), valid)
-    return (float(values[0]), float(values[1]), float(values[2]))
+    try:
+        first, second, third = map(float, values)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ParameterError(name, values, valid) from error
+    return first, second, third
 
 
 def task_from_json(data: dict[str, Any]) -> TaskSpace:
