@@ -37,7 +37,8 @@ def read_text(path: Path, names: Sequence[str] | None) -> Iterator[Array]:
         labels = [str(k) for k in range(len(cells))]
         wanted = [labels[k] for k in _wanted(path, cells, names)] if header else labels
         options = (
-            csv.ReadOptions(column_names=labels),
+            # with threads of its own, it aborts a process that ends soon after, once in fifty times
+            csv.ReadOptions(column_names=labels, use_threads=False),
             csv.ParseOptions(delimiter=delimiter),
             csv.ConvertOptions(include_columns=wanted, column_types=dict.fromkeys(wanted, float64())),
         )
@@ -62,7 +63,7 @@ def read_parquet(path: Path, names: Sequence[str] | None) -> Iterator[Array]:
         kind = file.schema_arrow.field(name).type
         if not (types.is_floating(kind) or types.is_integer(kind)):
             raise FileFormatError(path, f"column '{name}' holds {kind}; valid: numbers")
-    for batch in file.iter_batches(_ROWS, columns=wanted):
+    for batch in file.iter_batches(_ROWS, columns=wanted, use_threads=False):
         columns = [batch.column(name).to_numpy(zero_copy_only=False) for name in wanted]
         yield np.column_stack(columns).astype(np.float64)
 

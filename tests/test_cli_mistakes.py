@@ -33,9 +33,9 @@ from grr_torch.cli.show import reports_errors
         ("build --robot planar_5 --bounds 0 1 0", "four or six numbers"),
         ("build --robot planar_5 --bounds 8 9 8 9", "no point within reach"),
         ("build --robot planar_5 --seeds none.csv", "none.csv: does not exist"),
-        ("build --robot planar_5 --seeds short.csv", "valid: (S, 5)"),
+        ("build --robot planar_5 --seeds short.csv", "short.csv: has 3 columns; valid: 5, or columns named joint_1"),
         ("build --robot planar_5 --seeds nan.csv", "nan.csv: row 1 holds NaN, infinite or missing values"),
-        ("build --robot planar_5 --seeds words.csv", "words.csv: has columns named no, numbers, here; valid: "),
+        ("build --robot planar_5 --seeds words.csv", "words.csv: has 3 columns; valid: 5, or columns named joint_1"),
         ("build --robot planar_5 --hold joint_1", "JOINT=VALUE"),
         ("build --robot planar_5 --hold elbow=1", "unknown joint 'elbow'"),
         ("build --robot planar_5 --margin -1", "margin: got -1.0"),
@@ -88,7 +88,7 @@ def test_a_mistake_is_one_clear_line_and_exit_code_2(tmp_path, words, complaint)
     (tmp_path / "short.csv").write_text("0 0 0")
     (tmp_path / "nan.csv").write_text("0 0 0 0 nan")
     (tmp_path / "words.csv").write_text("no numbers here")
-    (tmp_path / "gap.csv").write_text("0.5,,0.5,0.5,0.5,0.5")
+    (tmp_path / "gap.csv").write_text("0.5,,0.5,0.5,0.5")
     (tmp_path / "xacro.urdf").write_text('<robot name="r" xmlns:xacro="x/xacro"><xacro:macro name="m"/></robot>')
     (tmp_path / "doctype.urdf").write_text('<!DOCTYPE r [<!ENTITY a "b">]><robot name="r"><link name="a"/>&a;</robot>')
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}

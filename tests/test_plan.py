@@ -107,8 +107,8 @@ def test_every_connected_edge_can_be_followed(roadmap):
     first, second = (planner._vertices(ends) for ends in roadmap.edges[roadmap.connected].T)
     ways = planner.ways.on_lines(first, second)
     missing = torch.tensor([way is None for way in ways]).nonzero()[:, 0]
-    # one in a thousand may graze the arm between the waypoints that the check of edges looked at
-    assert len(missing) <= 1e-3 * len(ways)
+    # one in five hundred may graze the arm between the waypoints that the check of edges looked at
+    assert len(missing) <= 2e-3 * len(ways)
     deeper = replace(roadmap, robot=replace(roadmap.robot, margin=roadmap.robot.margin - 1e-3))
     again = Planner(deeper)
     ends = (again._vertices(ends[missing]) for ends in roadmap.edges[roadmap.connected].T)

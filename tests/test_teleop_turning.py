@@ -29,12 +29,12 @@ def planar_pose(planar_5) -> grr_torch.Roadmap:
 
 @pytest.fixture(scope="module")
 def yaw(kinova) -> grr_torch.Roadmap:
-    return grr_torch.build(kinova, "yaw", points=600, rotations=8, candidates=4, refine=False)
+    return grr_torch.build(kinova, "yaw", points=600, rotations=8, refine=False)
 
 
 @pytest.fixture(scope="module")
 def axis(kinova) -> grr_torch.Roadmap:
-    return grr_torch.build(kinova, "axis", points=200, rotations=16, candidates=2, refine=False)
+    return grr_torch.build(kinova, "axis", points=200, rotations=16, refine=False)
 
 
 @pytest.fixture(params=["planar_pose", "yaw", "axis"])
