@@ -14,7 +14,7 @@ import grr_torch
 from grr_torch.applications.nearest import Manifolds, MovedBy
 from grr_torch.robots.curvature import force_derivative
 from grr_torch.spaces.configuration import distance
-from grr_torch.spaces.pyramids import pyramid_corners, pyramid_weights
+from grr_torch.spaces.pyramids import pyramid_corners, pyramid_weights, whole_pyramids
 
 
 @pytest.mark.parametrize("mimic", [False, True])
@@ -102,6 +102,10 @@ def test_weights_of_pyramids_give_back_the_point(bounds):
     pyramids = lattice.pyramids(points - low)
     weights = pyramid_weights(lattice, points - low, pyramids)
     corners = pyramid_corners(lattice)
+    some = torch.randperm(len(corners), generator=torch.Generator().manual_seed(1))[:50]
+    assert torch.equal(pyramid_corners(lattice, some), corners[some])
+    counts = torch.rand(len(graph.points), generator=torch.Generator().manual_seed(2)) < 0.8
+    assert torch.equal(whole_pyramids(lattice, counts), counts[corners].all(1))
     assert corners.shape == (2 * len(bounds) * math.prod(lattice.cells), 3 if len(bounds) == 2 else 5)
     assert float(weights.min()) > -1e-12
     torch.testing.assert_close(weights.sum(1), torch.ones_like(weights[:, 0]))

@@ -24,7 +24,7 @@ from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns, project_columns
 from grr_torch.spaces.configuration import average, average_of_few, difference, embed
 from grr_torch.spaces.graph import find_lattice
-from grr_torch.spaces.pyramids import pyramid_corners, pyramid_weights
+from grr_torch.spaces.pyramids import pyramid_corners, pyramid_weights, whole_pyramids
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -102,6 +102,10 @@ class Solver:
         # where rotation varies, suspects are looked up by their nearest vertices
         self._lattice, self._resolved = None if turning else find_lattice(roadmap.points), roadmap.resolved
         self._suspect = self._uncertified_places(roadmap)
+        if self._lattice is not None:
+            # what is outside lacks nothing
+            lacking = ~whole_pyramids(self._lattice, self._resolved)
+            self._lacking = torch.cat([lacking, lacking.new_zeros(1)])
 
     def __call__(self, points: Tensor, *, progress: Progress = silent) -> Solution:
         """`Roadmap.solve`."""
@@ -242,10 +246,12 @@ class Solver:
             return
         offsets = torch.from_numpy(positions) - self.low
         places = self._lattice.pyramids(offsets)
-        suspect, lacking = self._suspect[places], ~self._resolved[pyramid_corners(self._lattice, places.clamp_min(0))]
-        rows = (lacking.any(1) & (places >= 0)).nonzero()[:, 0]
-        weights = pyramid_weights(self._lattice, offsets[rows], places[rows])
-        suspect[rows] |= (lacking[rows] & (weights > _ON_FACE)).any(1)
+        suspect = self._suspect[places]
+        rows = self._lacking[places].nonzero()[:, 0]
+        if len(rows):
+            lacking = ~self._resolved[pyramid_corners(self._lattice, places[rows])]
+            weights = pyramid_weights(self._lattice, offsets[rows], places[rows])
+            suspect[rows] |= (lacking & (weights > _ON_FACE)).any(1)
         codes[suspect.numpy()] = _UNCERTIFIED
 
     def _uncertified_places(self, roadmap: Roadmap) -> Tensor:

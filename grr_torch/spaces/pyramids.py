@@ -42,6 +42,20 @@ def pyramid_corners(lattice: Lattice, pyramids: Tensor | None = None) -> Tensor:
     return torch.cat([first[:, None] + shifts.T[axis], corners + cell[:, None]], dim=1)
 
 
+def whole_pyramids(lattice: Lattice, counts: Tensor) -> Tensor:
+    """(P,) bool, the pyramids all of whose corners are among the vertices (V,) that count."""
+    d, corners = len(lattice.cells), math.prod(count + 1 for count in lattice.cells)
+    corner = counts[:corners].reshape([count + 1 for count in lattice.cells])
+    centre = counts[corners:].reshape(lattice.cells)
+    whole = centre[..., None].repeat(*[1] * d, 2 * d)
+    for axis, upper in itertools.product(range(d), (0, 1)):
+        for shift in itertools.product((0, 1), repeat=d - 1):
+            shifts = (*shift[:axis], upper, *shift[axis:])
+            window = tuple(slice(s, s + count) for s, count in zip(shifts, lattice.cells, strict=True))
+            whole[..., 2 * axis + upper] &= corner[window]
+    return whole.flatten()
+
+
 def pyramid_weights(lattice: Lattice, offsets: Tensor, pyramids: Tensor) -> Tensor:
     """Barycentric weights (N, K) of the corners of the pyramids that points lie in. Differentiable.
 
