@@ -13,7 +13,8 @@ from teleoperated import follow_targets, some_vertices
 import grr_torch
 from grr_torch.applications.example_paths import example_path
 from grr_torch.applications.replay import replay
-from grr_torch.applications.teleoperate import STATUSES, Teleoperator
+from grr_torch.applications.steps import STATUSES
+from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.errors import ParameterError
 from grr_torch.interactive.session import Session
 from grr_torch.projection.project import project, tool_points

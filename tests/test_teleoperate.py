@@ -9,9 +9,9 @@ import grr_torch
 from grr_torch.applications.braking import limit_acceleration
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.routes import Routes
-from grr_torch.applications.steps import Steps
+from grr_torch.applications.steps import STATUSES, Steps
 from grr_torch.applications.straight import Straight
-from grr_torch.applications.teleoperate import STATUSES, Teleoperator
+from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.experiments.paths import draw_paths
 from grr_torch.projection.project import Tolerances
 

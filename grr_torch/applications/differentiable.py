@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.applications.nearest import Manifolds, MovedBy
-from grr_torch.applications.solve import STATUSES, Solution, Solver
+from grr_torch.applications.solve import LAST_VALID, STATUSES, Solution, Solver
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
 from grr_torch.progress import Progress, silent
@@ -81,7 +81,7 @@ class DifferentiableSolver:
         progress("solving", count, count)
         q, codes = (torch.cat(parts, -1) for parts in zip(*found, strict=True))
         status = np.array(STATUSES)[codes.numpy()].reshape(batch)
-        valid = (codes <= _UNCERTIFIED).to(q.device)
+        valid = (codes <= LAST_VALID).to(q.device)
         return Solution(q.T.reshape(*batch, robot.n), valid.reshape(batch), status)
 
     def _solve(self, targets: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from grr_torch.applications.lines import Follower
-from grr_torch.applications.solve import Solver
+from grr_torch.applications.solve import LAST_VALID, Solver
 from grr_torch.pieces import LAST, NEXT, Array, Mask, norms
 from grr_torch.spaces.task import TaskSpace
 
@@ -103,7 +103,7 @@ def _solve(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Ma
     guesses, codes = (
         part.numpy() for part in solver.guess(torch.from_numpy(points.astype(np.float64)), certified=False)
     )
-    guesses, rows = guesses.astype(points.dtype), (codes <= 1).nonzero()[0]
+    guesses, rows = guesses.astype(points.dtype), (codes <= LAST_VALID).nonzero()[0]
     q, strayed = np.full_like(guesses, np.nan), np.full(len(points), np.nan, points.dtype)
     solved, valid = follower.solved(points[rows].T, guesses[rows].T, _ITERATIONS)
     rows, solved = rows[valid], solved.T[valid]

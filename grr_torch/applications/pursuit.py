@@ -9,7 +9,7 @@ import torch
 
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.lines import Follower
-from grr_torch.applications.solve import Solver
+from grr_torch.applications.solve import LAST_VALID, Solver
 from grr_torch.pieces import Array, Mask, norms, some
 
 # control steps that are looked ahead at most
@@ -137,7 +137,7 @@ class Pursuit:
         """Which points (A, K, width) are likely open (A, K), and the steps there (A, K) from configurations (A, n)."""
         flat = torch.from_numpy(points.reshape(-1, points.shape[2]))
         guesses, codes = self.solver.guess(flat, certified=False)
-        likely = codes <= 1
+        likely = codes <= LAST_VALID
         if self.follower.task.rotations is None:  # else, to look for the nearest vertex takes long
             likely &= self.solver.nearest(flat)[0][:, 0] <= _OPEN * self.solver.radius
         open_: Mask = likely.numpy().reshape(points.shape[:2])

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 # what a status says; the first two are those of valid configurations
 STATUSES = ("solved", "uncertified", "outside", "too far", "not converged", "off the map", "self-collision", "no cell")
 _SOLVED, _UNCERTIFIED, _OUTSIDE, _TOO_FAR, _NOT_CONVERGED, _OFF_THE_MAP, _SELF_COLLISION, _ = range(len(STATUSES))
+# configurations of these statuses and those before are valid
+LAST_VALID = _UNCERTIFIED
 
 # points worked on together, on the CPU and on a GPU: enough that the few that do not converge cost little beside them,
 # and on the CPU, where rotation varies and a point has three times as many vertices around it, fewer for the memory
@@ -121,7 +123,7 @@ class Solver:
             done = part.stop
             progress("solving", done, count)
         status = np.array(STATUSES)[codes.numpy()].reshape(batch)
-        valid = (codes <= _UNCERTIFIED).to(q.device)
+        valid = (codes <= LAST_VALID).to(q.device)
         return Solution(q.reshape(*batch, self.robot.n), valid.reshape(batch), status)
 
     def _in_parts(self, columns: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
@@ -151,13 +153,13 @@ class Solver:
         failed = (codes >= _NOT_CONVERGED).nonzero()[:, 0]
         if len(failed):
             again, second = self.solve_from(targets[:, failed], *self.guess(points[failed], of_nearest=True))
-            good = second <= _UNCERTIFIED
+            good = second <= LAST_VALID
             q[:, failed[good]], codes[failed[good]] = again[:, good], _UNCERTIFIED
         return q, codes
 
     def solve_from(self, targets: Tensor, guesses: Tensor, codes: Tensor) -> tuple[Tensor, Tensor]:
         """`solve_columns` from what `guess` gave."""
-        near = (codes <= _UNCERTIFIED).nonzero()[:, 0].to(targets.device)
+        near = (codes <= LAST_VALID).nonzero()[:, 0].to(targets.device)
         q = targets.new_full((self.robot.n, len(guesses)), torch.nan)
         solved, valid = project_columns(
             self.robot,

@@ -9,7 +9,9 @@ import numpy as np
 from grr_torch.applications.arms import Arms
 from grr_torch.pieces import Array, Mask
 
-TRACKING, DETOURING, HOLDING, UNREACHABLE = range(4)
+# what a status says, and the codes of these
+STATUSES = np.array(["tracking", "detouring", "holding", "unreachable"])
+TRACKING, DETOURING, HOLDING, UNREACHABLE = range(len(STATUSES))
 
 
 class Steps(NamedTuple):

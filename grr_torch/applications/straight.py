@@ -7,7 +7,7 @@ import torch
 
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.lines import Follower, Lines
-from grr_torch.applications.solve import Solver
+from grr_torch.applications.solve import LAST_VALID, Solver
 from grr_torch.applications.steps import TRACKING, UNREACHABLE, Steps
 from grr_torch.pieces import Array, Mask, norms, some
 
@@ -28,7 +28,7 @@ class Straight:
         nobody = np.zeros(len(which), dtype=bool)
         near = guesses.numpy().astype(targets.dtype)
         lines, found, offsets = self._lines(arms, which, targets, near, nobody)
-        direct: Mask = found & lines.direct & (codes.numpy() <= 1)
+        direct: Mask = found & lines.direct & (codes.numpy() <= LAST_VALID)
         arms.offsets[which[direct]], arms.offset_at[which[direct]] = offsets[direct], targets[direct]
         return Steps(lines.steps, lines.ends, lines.points, np.full(len(which), TRACKING)), direct
 
@@ -46,7 +46,7 @@ class Straight:
         if len(rows):
             points = torch.from_numpy(targets[rows].astype(np.float64))
             guesses, codes = (part.numpy() for part in self.solver.guess(points, certified=False))
-            ends[rows], known[rows] = guesses, codes <= 1
+            ends[rows], known[rows] = guesses, codes <= LAST_VALID
         valid, direct = np.zeros_like(lost), self._rests(arms, which, lost)
         steps.points[direct], steps.codes[direct] = arms.p[which[direct]], UNREACHABLE
         rows = (known & ~direct).nonzero()[0]

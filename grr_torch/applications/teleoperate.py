@@ -17,7 +17,8 @@ from grr_torch.applications.pilot import Pilot
 from grr_torch.applications.pursuit import Pursuit
 from grr_torch.applications.retime import per_joint, usual_speeds
 from grr_torch.applications.routes import Routes
-from grr_torch.applications.steps import HOLDING
+from grr_torch.applications.solve import LAST_VALID
+from grr_torch.applications.steps import HOLDING, STATUSES
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import Array, Mask, norms, one_thread
 from grr_torch.projection.project import Tolerances
@@ -31,8 +32,6 @@ _ITERATIONS = 6
 _DRIFT = 0.03
 # seconds that can be looked ahead
 _FARTHEST_AHEAD = 60.0
-# what a status says, by the codes of steps
-STATUSES = np.array(["tracking", "detouring", "holding", "unreachable"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +222,7 @@ class Teleoperator:
         solver, points = self.roadmap.solver, torch.from_numpy(targets)
         q, codes = solver.solve_columns(points.T.contiguous())
         vertices = solver.nearest(points)[1][:, 0]
-        placed = torch.where((codes <= 1)[:, None], q.T, solver.configurations[vertices])
+        placed = torch.where((codes <= LAST_VALID)[:, None], q.T, solver.configurations[vertices])
         self._batch, self._arms = batch, Arms.at(self._follower, placed.numpy())
 
     def _normalise(self, targets: Array) -> Mask:

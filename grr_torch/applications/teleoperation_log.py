@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from grr_torch.applications.teleoperate import STATUSES
+from grr_torch.applications.steps import STATUSES
 from grr_torch.errors import ParameterError
 from grr_torch.output import atomic_write
 from grr_torch.pieces import one_thread

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.applications.motions import SUBSTEPS
-from grr_torch.applications.solve import Solver
+from grr_torch.applications.solve import LAST_VALID, Solver
 from grr_torch.projection.project import project_columns, tool_points
 from grr_torch.spaces.configuration import difference, distance, interpolate
 
@@ -92,7 +92,7 @@ class WayFinder:
         def middle(pa: Tensor, pb: Tensor, qa: Tensor, qb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             points = self.solver.task.interpolate(pa.T, pb.T, 0.5).T
             q, codes = self.solver.solve_columns(points)
-            return points, q, (codes <= 1).to(q.device)
+            return points, q, (codes <= LAST_VALID).to(q.device)
 
         return self._ways(starts, ends, middle, straight=True)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from grr_torch.applications.teleoperate import STATUSES
+from grr_torch.applications.steps import STATUSES
 from grr_torch.applications.teleoperation_log import TeleoperationLog
 from grr_torch.errors import ParameterError
 from grr_torch.output import atomic_write
