@@ -49,6 +49,18 @@ def tiny_ik(planar_roadmap) -> NeuralIK:
 
 
 @pytest.fixture
+def load(tmp_path):
+    """Loads a robot from the text of a URDF."""
+
+    def read(text, **options):
+        path = tmp_path / "robot.urdf"
+        path.write_text(text)
+        return grr_torch.load_robot(path, **options)
+
+    return read
+
+
+@pytest.fixture
 def run_cli(tmp_path, monkeypatch, capfd):
     """Runs a command in a folder of its own; gives its exit code and what it printed."""
     monkeypatch.chdir(tmp_path)

@@ -13,16 +13,6 @@ from grr_torch.errors import MeshNotFoundError
 from grr_torch.robots.fit_spheres import fit_spheres
 
 
-@pytest.fixture
-def load(tmp_path):
-    def read(text, **options):
-        path = tmp_path / "robot.urdf"
-        path.write_text(text)
-        return grr_torch.load_robot(path, **options)
-
-    return read
-
-
 def meshed(mesh, tag="collision"):
     """An arm of one joint, whose link b has a mesh."""
     link = f'<link name="b"><{tag}><geometry><mesh filename="{mesh}"/></geometry></{tag}></link>'

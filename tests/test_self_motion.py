@@ -285,9 +285,8 @@ def test_the_command_prints_writes_and_refuses(tmp_path):
     count = sum(part["samples"] for point in data["points"] for part in point["components"])
     assert arrays["configurations"].shape == (count, 3)
     assert arrays["component"].max() + 1 == len(arrays["closed"]) == len(arrays["component_point"])
-    table = CliRunner().invoke(
-        app, join_numbers(["smm", "--robot", "planar_5", "--point", "0.2", "-0.1", "--samples", "50"])
-    )
+    words = ["smm", "--robot", "planar_5", "--point", "0.2", "-0.1", "--samples", "50"]
+    table = CliRunner().invoke(app, join_numbers(words))
     assert table.exit_code == 0, table.output
     assert "no curve" in table.output
     for words, message in (

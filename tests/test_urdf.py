@@ -16,16 +16,6 @@ from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError, UrdfE
 from grr_torch.spaces.configuration import normalise
 
 
-@pytest.fixture
-def load(tmp_path):
-    def read(text, **options):
-        path = tmp_path / "robot.urdf"
-        path.write_text(text)
-        return grr_torch.load_robot(path, **options)
-
-    return read
-
-
 def test_limits_are_those_of_the_urdf(load):
     robot = load(robot_text(hinge("j", "a", "b")))
     assert (robot.lower.item(), robot.upper.item(), robot.velocity_limits.item()) == (-1.0, 1.0, 2.0)
@@ -165,7 +155,7 @@ def test_limits_that_are_hardly_meant_are_warned_of_once(load, kind, limit, comp
     for warning in warned:
         assert warning.category is GrrWarning
         assert re.search(rf"robot\.urdf: {complaint}.* \(i, j\)$", str(warning.message))
-        assert warning.filename == __file__
+        assert warning.filename == load.__code__.co_filename
 
 
 @pytest.mark.parametrize("name", grr_torch.robot_names())

@@ -7,18 +7,7 @@ import re
 import pytest
 from small_urdfs import HINGE, hinge, robot_text
 
-import grr_torch
 from grr_torch.errors import UrdfError
-
-
-@pytest.fixture
-def load(tmp_path):
-    def read(text, **options):
-        path = tmp_path / "robot.urdf"
-        path.write_text(text)
-        return grr_torch.load_robot(path, **options)
-
-    return read
 
 
 @pytest.mark.parametrize(

@@ -38,10 +38,10 @@ def rejoin(follower: Follower, q: Tensor, ends: Tensor, tries: int = 0) -> Tenso
     robot = follower.robot
     motion = difference(q, ends, robot.continuous)
     lengths = motion.norm(dim=1)
-    if bool((lengths < _ARRIVED).any()) and not bool(clearance(follower, q[None])[0] < 0.0):
+    floor = clearance(follower, q[None])[0].clamp_max(0.0)
+    if bool((lengths < _ARRIVED).any()) and float(floor) == 0.0:
         return None
     motion = motion[lengths.argsort()]
-    floor = clearance(follower, q[None])[0].clamp_max(0.0)
     free = torch.arange(len(motion), device=q.device)
     for count in (_COARSE, _CHECKED):
         fractions = torch.arange(1, count + 1, dtype=q.dtype, device=q.device)[:, None, None] / count
