@@ -185,7 +185,7 @@ def test_input_that_is_refused_every_other_time_hides_no_target(roadmap, phase):
         return command
 
     follow(out, 120)
-    held = torch.from_numpy(teleoperator._arms.held)
+    held = torch.from_numpy(teleoperator._arms.hold.point)
     assert bool(held.isfinite().all())
     # nearer to the held point than to any vertex
     goals = 0.97 * held
@@ -206,12 +206,12 @@ def test_a_target_that_becomes_solvable_is_noticed_on_a_detour_too(roadmap):
     for _ in range(13):
         command = teleoperator.step(out)
     arms = teleoperator._arms
-    goals = 0.97 * torch.from_numpy(arms.held)
+    goals = 0.97 * torch.from_numpy(arms.hold.point)
     changed = torch.from_numpy(command.status == "detouring") & roadmap.solve(goals).valid
     assert int(changed.sum()) >= 8
     for _ in range(6):
         teleoperator.step(goals)
-    assert not arms.holds(changed.nonzero()[:, 0].numpy()).any()
+    assert not arms.hold.known(changed.nonzero()[:, 0].numpy()).any()
 
 
 def test_arms_do_not_go_to_and_fro_beside_a_hole(roadmap):

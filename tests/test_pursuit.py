@@ -96,10 +96,10 @@ def _watched(roadmap, targets, rate, seen):
     pursuit = Pursuit(follower, roadmap.solver, rate, 2.0)
     motions = []
     for target, given in zip(targets.numpy(), seen, strict=True):
-        arms.unchanged += 1
+        arms.meeting.unchanged += 1
         which = np.arange(targets.shape[1]) if given else np.arange(0)
         pursuit.aims(arms, which, target[which])
-        motions.append(arms.velocity.copy())
+        motions.append(arms.meeting.velocity.copy())
     return np.stack(motions)
 
 

@@ -146,7 +146,7 @@ def test_a_swing_that_has_arrived_is_over(kinova_roadmap):
     arms = Teleoperator(kinova_roadmap, start=kinova_roadmap.configurations[some_vertices(kinova_roadmap, 1)])
     detours, state, which = arms._pilot.detours, arms._arms, np.arange(1)
     for start in (state.q, state.q + 0.01):
-        state.swing[0] = start[0]
+        state.detour.swing[0] = start[0]
         goal = start + 0.04
         steps, _, free = detours.swing(state, which, goal)
         moved = np.abs(steps - state.q).max()

@@ -36,14 +36,15 @@ class Detours:
 
     def set_goals(self, arms: Arms, which: Array, goals: Array) -> None:
         """Arms have no way straight to goals (A, width); where these have moved, there is no route to them yet."""
-        moved = ~self.follower.same_goal(goals, arms.last_goal[which])
+        detour = arms.detour
+        moved = ~self.follower.same_goal(goals, detour.last_goal[which])
         # whose straight way to the same goal came to nothing trusts the next one later, lest it goes to and fro
-        again = ~arms.detours(which)
-        longer = np.minimum(np.where(again, 2 * arms.doubt[which], arms.doubt[which]), _MOST_DOUBT)
-        arms.doubt[which] = np.where(moved, 1, longer)
+        again = ~detour.under_way(which)
+        longer = np.minimum(np.where(again, 2 * detour.doubt[which], detour.doubt[which]), _MOST_DOUBT)
+        detour.doubt[which] = np.where(moved, 1, longer)
         for arm in which[moved].tolist():
-            arms.avoided[arm] = frozenset()
-        arms.last_goal[which[moved]], arms.last_vertex[which[moved]] = goals[moved], -1
+            detour.avoided[arm] = frozenset()
+        detour.last_goal[which[moved]], detour.last_vertex[which[moved]] = goals[moved], -1
 
     def swing(self, arms: Arms, which: Array, goals_q: Array) -> tuple[Array, Array, Mask]:
         """Swings of arms to configurations (A, n), or next to them. No route is quicker.
@@ -53,9 +54,10 @@ class Detours:
         Returns:
             Steps (A, n), the points (A, width) where tools are after them, and which swings (A,) are free.
         """
-        under_way = self.follower.distance(arms.swing[which], goals_q) < self.follower.epsilon
-        under_way &= self.follower.distance(arms.q[which], arms.swing[which]) >= _ARRIVED
-        ends = np.where(under_way[:, None], arms.swing[which], goals_q)
+        detour = arms.detour
+        under_way = self.follower.distance(detour.swing[which], goals_q) < self.follower.epsilon
+        under_way &= self.follower.distance(arms.q[which], detour.swing[which]) >= _ARRIVED
+        ends = np.where(under_way[:, None], detour.swing[which], goals_q)
         steps, points, free = arms.q[which], arms.p[which], np.zeros_like(under_way)
         for wholly, rows in ((False, under_way.nonzero()[0]), (True, (~under_way).nonzero()[0])):
             if len(rows):
@@ -64,16 +66,16 @@ class Detours:
                 steps[rows], points[rows] = lines.steps, lines.points
                 free[rows] = lines.direct if wholly else lines.safe
         # a route is left for a swing that is free, not for one that is refused
-        arms.swing[which] = np.where(free[:, None], ends, np.nan)
-        arms.next_vertex[which[free]] = -1
-        arms.blind[which[self.follower.distance(steps, ends) < _ARRIVED]] = 0
+        detour.swing[which] = np.where(free[:, None], ends, np.nan)
+        detour.next_vertex[which[free]] = -1
+        detour.blind[which[self.follower.distance(steps, ends) < _ARRIVED]] = 0
         return steps, points, free
 
     def set_last_vertices(self, arms: Arms, which: Array, goals: Array, goals_q: Array) -> None:
         """Looks for last vertices of routes to goals (A, width), configurations (A, n), where they are not known."""
-        unknown = arms.last_vertex[which] < 0
+        unknown = arms.detour.last_vertex[which] < 0
         if unknown.any():
-            arms.last_vertex[which[unknown]] = self._last_vertices(goals[unknown], goals_q[unknown])
+            arms.detour.last_vertex[which[unknown]] = self._last_vertices(goals[unknown], goals_q[unknown])
 
     def follow(self, arms: Arms, which: Array, briefly: Mask) -> tuple[Array, Mask]:
         """Steps (A, n) of arms on the quickest paths to their last vertices, and which found no way (A,).
@@ -81,16 +83,17 @@ class Detours:
         Arms that have to do it `briefly` (A,), for something else took time, go on to the next vertex; others try to
         leave some out.
         """
+        detour = arms.detour
         result, left = arms.q[which].copy(), np.ones(len(which), dtype=bool)
-        ends = arms.last_vertex[which].tolist()
+        ends = detour.last_vertex[which].tolist()
         for fresh in (False, True):
             # where the next vertex of a route cannot be gone to any more, a new way in is looked for
-            rows = (left & ((arms.next_vertex[which] >= 0) | fresh)).nonzero()[0].tolist()
+            rows = (left & ((detour.next_vertex[which] >= 0) | fresh)).nonzero()[0].tolist()
             entries = self._nearest(arms.p[which], _ENTRIES) if fresh and rows else None
             tried: list[tuple[int, int, float, bool]] = []
             for row in rows:
-                cost, following = self.routes.towards(ends[row], arms.avoided[int(which[row])])
-                current = int(arms.next_vertex[which[row]])
+                cost, following = self.routes.towards(ends[row], detour.avoided[int(which[row])])
+                current = int(detour.next_vertex[which[row]])
                 ahead = _ahead(current, following) if entries is None else entries[row].tolist()
                 on_edge = 0 if fresh else 1 + self._arrived(arms, int(which[row]))
                 if briefly[row] and not fresh:
@@ -109,29 +112,31 @@ class Detours:
         Returns:
             (A,) those that were given up.
         """
+        detour = arms.detour
         share = (np.abs(steps - arms.q[which]) / self.follower.longest.numpy()).max(1)
-        heading = arms.next_vertex[which]
+        heading = detour.next_vertex[which]
         there = self.follower.distance(steps, self._placed[heading]) < _ARRIVED
-        ended = share <= np.where(there & (heading != arms.last_vertex[which]), _ARRIVED, _ALL_BUT_ENDED)
+        ended = share <= np.where(there & (heading != detour.last_vertex[which]), _ARRIVED, _ALL_BUT_ENDED)
         for row in ended.nonzero()[0].tolist():
             arm = int(which[row])
-            edge = self._edge_ahead(arms, arm) if there[row] else (int(arms.left_vertex[arm]), int(heading[row]))
-            if min(edge) >= 0 and len(arms.avoided[arm]) < _MOST_AVOIDED:
-                arms.avoided[arm] |= {edge}
-                arms.next_vertex[arm] = heading[row] if there[row] else -1
+            edge = self._edge_ahead(arms, arm) if there[row] else (int(detour.left_vertex[arm]), int(heading[row]))
+            if min(edge) >= 0 and len(detour.avoided[arm]) < _MOST_AVOIDED:
+                detour.avoided[arm] |= {edge}
+                detour.next_vertex[arm] = heading[row] if there[row] else -1
             else:
-                arms.barred[arm] = targets[row]
-            arms.blind[arm] = 0
+                arms.hold.barred[arm] = targets[row]
+            detour.blind[arm] = 0
         return ended
 
     def _edge_ahead(self, arms: Arms, arm: int) -> tuple[int, int]:
         """The edge on which an arm at the next vertex of its route goes on; a negative vertex where there is none."""
-        here, last = int(arms.next_vertex[arm]), int(arms.last_vertex[arm])
-        return here, -1 if here == last else int(self.routes.towards(last, arms.avoided[arm])[1][here])
+        detour = arms.detour
+        here, last = int(detour.next_vertex[arm]), int(detour.last_vertex[arm])
+        return here, -1 if here == last else int(self.routes.towards(last, detour.avoided[arm])[1][here])
 
     def _arrived(self, arms: Arms, arm: int) -> bool:
         """Whether an arm is at the vertex that its route led to."""
-        return bool(self.follower.distance(arms.q[arm], self._placed[arms.next_vertex[arm]]) < _ARRIVED)
+        return bool(self.follower.distance(arms.q[arm], self._placed[arms.detour.next_vertex[arm]]) < _ARRIVED)
 
     def _enter(
         self, arms: Arms, which: Array, result: Array, left: Mask, tried: list[tuple[int, int, float, bool]]
@@ -146,6 +151,7 @@ class Detours:
             tried: Row in `which`, vertex, length of the way from there, and whether the arm is on an edge that leads
                 there, which is known to be continuous.
         """
+        detour = arms.detour
         owner, vertex, lengths, on_edge = (np.array(part) for part in zip(*tried, strict=True))
         q, p = arms.q[which[owner]], arms.p[which[owner]]
         placed, points = self._placed[vertex], self._points[vertex]
@@ -159,8 +165,8 @@ class Detours:
             if total[best] < np.inf:
                 arm = which[row]
                 result[row], left[row] = lines.steps[best], False
-                if vertex[best] != arms.next_vertex[arm]:
-                    arms.left_vertex[arm], arms.next_vertex[arm] = arms.next_vertex[arm], vertex[best]
+                if vertex[best] != detour.next_vertex[arm]:
+                    detour.left_vertex[arm], detour.next_vertex[arm] = detour.next_vertex[arm], vertex[best]
 
     def _last_vertices(self, goals: Array, goals_q: Array) -> Array:
         """Of the vertices round each goal that it is joined to by a continuous line, the one most like it.

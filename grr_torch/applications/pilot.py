@@ -78,7 +78,7 @@ class Pilot:
             arms.tracks[which[rows]] = False
             steps.put(rows, self._decided(arms, which[rows], aims[rows]))
             arms.tracks[which[rows]] = steps.codes[rows] == TRACKING
-        ahead = (arms.meeting(which) & (steps.codes != HOLDING)).nonzero()[0]
+        ahead = (arms.meeting.planned(which) & (steps.codes != HOLDING)).nonzero()[0]
         if len(ahead):
             near = self.follower.same_goal(arms.p[which[ahead]], targets[ahead])
             steps.codes[ahead[~near]] = DETOURING
@@ -90,14 +90,14 @@ class Pilot:
         Steps that take long take turns with others. On a route, one that looks for a straight way comes after one that
         only follows the route; and points to hold at are searched for in every other step, of all arms at once.
         """
-        on_route = arms.detours(which) & arms.on_task[which]
-        blind = on_route & (arms.blind[which] > 0)
+        on_route = arms.detour.under_way(which) & arms.on_task[which]
+        blind = on_route & (arms.detour.blind[which] > 0)
         if blind.any():
-            blind &= self.follower.same_goal(targets, arms.aimed[which])
-            arms.blind[which[blind]] -= 1
+            blind &= self.follower.same_goal(targets, arms.detour.aimed[which])
+            arms.detour.blind[which[blind]] -= 1
         # what was found in the last step is acted on first, however the target leaps
-        found = on_route & arms.searched[which]
-        wanted = self._search(arms, which, targets, arms.holds(which) & ~blind & ~found)
+        found = on_route & arms.hold.searched[which]
+        wanted = self._search(arms, which, targets, arms.hold.known(which) & ~blind & ~found)
         steps, ends = Steps.none_yet(arms, which), np.full_like(arms.q[which], np.nan)
         round_ = _Round(arms, which, targets, steps, ends)
         on_way = on_route & (blind | wanted)
@@ -117,16 +117,17 @@ class Pilot:
         Returns:
             (A,) the arms for which that was due in this step; some of them wait.
         """
+        hold = arms.hold
         if not holding.any():
-            arms.waited[which] = False
+            hold.waited[which] = False
             return holding
-        leapt = ~self.follower.same_goal(targets, arms.sought[which])
-        wanted = holding & (leapt | ~arms.searched[which])
-        search = wanted & (leapt | arms.waited[which] | arms.turn)
+        leapt = ~self.follower.same_goal(targets, hold.sought[which])
+        wanted = holding & (leapt | ~hold.searched[which])
+        search = wanted & (leapt | hold.waited[which] | arms.turn)
         waits = (wanted & ~search).nonzero()[0]
         if len(waits):
-            search[waits] = much_nearer(self.follower, self.solver, arms.held[which[waits]], targets[waits])[0]
-        arms.waited[which] = wanted & ~search
+            search[waits] = much_nearer(self.follower, self.solver, hold.point[which[waits]], targets[waits])[0]
+        hold.waited[which] = wanted & ~search
         if search.any():
             self._hold(arms, which[search], targets[search])
         return wanted
@@ -141,10 +142,11 @@ class Pilot:
         if len(rows) == 0:
             return routed
         arms, which, targets = round_.arms, round_.which[rows], round_.targets[rows]
-        lost = arms.holds(which) & ~arms.solvable[which]
+        lost = arms.hold.known(which) & ~arms.hold.solvable[which]
         made, found, valid, direct = self.straight.steps(arms, which, targets, lost)
-        arms.searched[which] = False
-        arms.forget(which[direct & ~lost])
+        arms.hold.searched[which] = False
+        arms.hold.forget(which[direct & ~lost])
+        arms.detour.forget(which[direct & ~lost])
         fresh = (~valid & ~lost).nonzero()[0]
         if len(fresh):
             self._hold(arms, which[fresh], targets[fresh])
@@ -152,16 +154,16 @@ class Pilot:
             again, found[fresh], _, direct[fresh] = self.straight.steps(arms, which[fresh], targets[fresh], every)
             made.put(fresh, again)
         direct |= self._stay(arms, which, targets, ~direct & ~valid, made)
-        arms.end_detour(which[direct])
+        arms.detour.end(which[direct])
         away = ~direct & ~self._hesitate(arms, which, targets, valid & ~direct, made)
-        arms.held[which[away & valid]], arms.held_q[which[away & valid]] = np.nan, np.nan
+        arms.hold.point[which[away & valid]], arms.hold.q[which[away & valid]] = np.nan, np.nan
         round_.steps.put(rows, made)
         round_.ends[rows], routed[rows] = found, away
         away &= arms.on_task[which]
         if away.any():
-            chosen, goals = which[away], np.where(valid[:, None], targets, arms.held[which])[away]
+            chosen, goals = which[away], np.where(valid[:, None], targets, arms.hold.point[which])[away]
             self.detours.set_goals(arms, chosen, goals)
-            arms.blind[chosen], arms.aimed[chosen] = arms.doubt[chosen], targets[away]
+            arms.detour.blind[chosen], arms.detour.aimed[chosen] = arms.detour.doubt[chosen], targets[away]
             on_swing = self._swing(round_, rows[away], found[away])
             routed[rows[away][on_swing]] = False
             others = ~on_swing
@@ -173,12 +175,12 @@ class Pilot:
 
         They do where it is hardly nearer to the target: a detour along the edge of reach leads away from it first.
         """
-        rows = (blocked & arms.on_task[which] & ~arms.detours(which)).nonzero()[0]
+        rows = (blocked & arms.on_task[which] & ~arms.detour.under_way(which)).nonzero()[0]
         gap, chosen = self.follower.task.gap_of_few, which[rows]
         away = gap(arms.p[chosen], targets[rows])
-        hardly = away - gap(arms.held[chosen], targets[rows]) < np.minimum((1.0 - NEARER) * away, _MUCH)
+        hardly = away - gap(arms.hold.point[chosen], targets[rows]) < np.minimum((1.0 - NEARER) * away, _MUCH)
         rows, chosen = rows[hardly], chosen[hardly]
-        arms.held[chosen], arms.held_q[chosen], arms.due[chosen] = arms.p[chosen], arms.q[chosen], 1
+        arms.hold.point[chosen], arms.hold.q[chosen], arms.hold.due[chosen] = arms.p[chosen], arms.q[chosen], 1
         steps.q[rows], steps.goals[rows] = arms.q[chosen], arms.q[chosen]
         steps.points[rows], steps.codes[rows] = arms.p[chosen], UNREACHABLE
         stays = np.zeros_like(blocked)
@@ -190,7 +192,7 @@ class Pilot:
         steps, points, free = self.detours.swing(round_.arms, round_.which[rows], goals_q)
         rows, made = rows[free], round_.steps
         made.q[rows], made.points[rows] = steps[free], points[free]
-        made.goals[rows] = round_.arms.swing[round_.which[rows]]
+        made.goals[rows] = round_.arms.detour.swing[round_.which[rows]]
         return free
 
     def _hesitate(self, arms: Arms, which: Array, targets: Array, turned: Mask, steps: Steps) -> Mask:
@@ -202,23 +204,24 @@ class Pilot:
         if not turned.any():
             return turned
         near = self.follower.same_goal(targets, arms.p[which]) & arms.on_task[which]
-        waits = turned & near & ~arms.detours(which) & (arms.hesitated[which] < _HESITATION)
-        arms.hesitated[which[waits]] += 1
+        waits = turned & near & ~arms.detour.under_way(which) & (arms.detour.hesitated[which] < _HESITATION)
+        arms.detour.hesitated[which[waits]] += 1
         steps.points[waits], steps.codes[waits] = arms.p[which[waits]], HOLDING
         return waits
 
     def _hold(self, arms: Arms, which: Array, targets: Array) -> None:
         """Looks for the nearest points to targets (A, width) that arms can hold at, and whether these are solvable."""
-        unset = ~arms.holds(which)
-        base = np.where(unset[:, None], arms.p[which], arms.held[which])
+        hold = arms.hold
+        unset = ~hold.known(which)
+        base = np.where(unset[:, None], arms.p[which], hold.point[which])
         # what is not to be gone to by any route must not be where a jump leads
-        here = unset & self.follower.same_goal(targets, arms.barred[which])
-        base_q = np.where(here[:, None], arms.q[which], arms.held_q[which])
-        level = np.where(unset, 0, arms.level[which])
+        here = unset & self.follower.same_goal(targets, hold.barred[which])
+        base_q = np.where(here[:, None], arms.q[which], hold.q[which])
+        level = np.where(unset, 0, hold.level[which])
         found = nearest_feasible(self.follower, self.solver, base, base_q, targets, level)
-        arms.due[which[norms(found[0] - arms.held[which]) != 0.0]] = _GRADUALLY
-        arms.held[which], arms.held_q[which], arms.solvable[which] = found
-        arms.level[which], arms.searched[which], arms.sought[which] = (level + 1) % LEVELS, True, targets
+        hold.due[which[norms(found[0] - hold.point[which]) != 0.0]] = _GRADUALLY
+        hold.point[which], hold.q[which], hold.solvable[which] = found
+        hold.level[which], hold.searched[which], hold.sought[which] = (level + 1) % LEVELS, True, targets
 
     def _lead(self, round_: _Round, routed: Mask, on_way: Mask, briefly: Mask) -> Mask:
         """Sets the steps of arms on routes: of those that have just been `routed`, or else taken back to their map.
@@ -228,10 +231,10 @@ class Pilot:
         """
         arms, which, targets, steps, ends = round_
         left = (routed & ~arms.on_task[which]) | on_way
-        swinging = on_way & arms.swings(which)
+        swinging = on_way & arms.detour.swinging(which)
         rows = swinging.nonzero()[0]
         if len(rows):
-            left[rows] = ~self._swing(round_, rows, arms.swing[which[rows]])
+            left[rows] = ~self._swing(round_, rows, arms.detour.swing[which[rows]])
         rows = (routed & arms.on_task[which] | on_way & ~swinging).nonzero()[0]
         if len(rows):
             chosen = which[rows]
@@ -252,7 +255,7 @@ class Pilot:
 
         Where it finds no way, to look again takes long.
         """
-        arms.end_detour(np.array([arm]))
+        arms.detour.end(np.array([arm]))
         if arms.rests[arm] > 0:
             arms.rests[arm] -= 1
             return None

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from grr_torch.applications.arms import Arms
+from grr_torch.applications.arms import Arms, Meeting
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.solve import LAST_VALID, Solver
 from grr_torch.pieces import Array, Mask, norms, some
@@ -61,26 +61,28 @@ class Pursuit:
         """The points (A, width) that some arms (A,) head for, whose targets are (A, width)."""
         if len(self._ahead) < 2:
             return targets
-        self._watch(arms, which, targets)
-        behind = arms.meeting(which)
-        due = behind | arms.holds(which) & ~arms.solvable[which]
+        meeting = arms.meeting
+        self._watch(meeting, which, targets)
+        behind = meeting.planned(which)
+        due = behind | arms.hold.known(which) & ~arms.hold.solvable[which]
         if not some(due):
-            arms.looks_in[which] = 0
+            meeting.looks_in[which] = 0
             return targets
-        moves = norms(arms.velocity[which]) > _REST / self.rate
-        arms.meets[which[~moves]] = np.nan
+        moves = norms(meeting.velocity[which]) > _REST / self.rate
+        meeting.place[which[~moves]] = np.nan
         due &= moves
-        arms.looks_in[which] = np.where(due, arms.looks_in[which] - 1, 0)
+        meeting.looks_in[which] = np.where(due, meeting.looks_in[which] - 1, 0)
         # not in the steps in which points to hold at are searched for
-        rows = (due & (arms.looks_in[which] <= 0)).nonzero()[0] if arms.turn else ()
+        rows = (due & (meeting.looks_in[which] <= 0)).nonzero()[0] if arms.turn else ()
         if len(rows):
-            arms.looks_in[which[rows]] = _EVERY
+            meeting.looks_in[which[rows]] = _EVERY
             self._look(arms, which[rows], targets[rows], behind[rows])
-        meeting = arms.meeting(which)
+        planned = meeting.planned(which)
         # who is next to its target keeps the same little way ahead of it
-        ahead = (meeting & (arms.caught_up[which] > 0)).nonzero()[0]
-        arms.meets[which[ahead]] = self._on_way(targets[ahead], arms.velocity[which[ahead]], np.array([_NEXT_TO]))[:, 0]
-        return np.where(meeting[:, None], arms.meets[which], targets)
+        ahead = (planned & (meeting.caught_up[which] > 0)).nonzero()[0]
+        little = self._on_way(targets[ahead], meeting.velocity[which[ahead]], np.array([_NEXT_TO]))
+        meeting.place[which[ahead]] = little[:, 0]
+        return np.where(planned[:, None], meeting.place[which], targets)
 
     def _on_way(self, targets: Array, velocity: Array, steps: Array) -> Array:
         """Points (A, K, width) where targets (A, width) are after steps (K,) with a velocity (A, d)."""
@@ -88,11 +90,11 @@ class Pursuit:
         points[..., : velocity.shape[1]] += steps.astype(targets.dtype)[:, None] * velocity[:, None]
         return points
 
-    def _watch(self, arms: Arms, which: Array, targets: Array) -> None:
+    def _watch(self, meeting: Meeting, which: Array, targets: Array) -> None:
         """How targets (A, width) move. They may be given less often than in every step."""
-        d, passed = self.follower.task.dimension, arms.unchanged[which]
-        motion = (targets - arms.given[which])[:, :d] / passed[:, None]
-        length, velocity = norms(motion), arms.velocity[which]
+        d, passed = self.follower.task.dimension, meeting.unchanged[which]
+        motion = (targets - meeting.given[which])[:, :d] / passed[:, None]
+        length, velocity = norms(motion), meeting.velocity[which]
         stale, rests = passed > _STALE * self.rate, length == 0.0
         # comparison with NaN, where there was no target yet, is false
         goes_on = (length <= _LEAP / self.rate) & ~stale & ~rests
@@ -101,16 +103,17 @@ class Pursuit:
         mean = velocity + share[:, None] * (motion - velocity)
         if not goes_on.all():
             mean = np.where(goes_on[:, None], mean, np.where((rests & ~stale)[:, None], velocity, 0.0))
-        arms.velocity[which] = mean
-        arms.going[which] = np.where(rests | goes_on & straight, arms.going[which] + 1, 0)
-        arms.given[which] = targets
-        arms.unchanged[which[~rests]] = 0
+        meeting.velocity[which] = mean
+        meeting.going[which] = np.where(rests | goes_on & straight, meeting.going[which] + 1, 0)
+        meeting.given[which] = targets
+        meeting.unchanged[which[~rests]] = 0
 
     def _look(self, arms: Arms, which: Array, targets: Array, behind: Mask) -> None:
         """Looks for where arms (A,) meet targets (A, width); those that are not `behind` (A,) may wait."""
-        steps, points = self._ahead, self._on_way(targets, arms.velocity[which], self._ahead)
+        meeting = arms.meeting
+        steps, points = self._ahead, self._on_way(targets, meeting.velocity[which], self._ahead)
         open_, needs = self._needs(arms.q[which], points)
-        known, rows = steps <= _AS_LONG * arms.going[which, None], np.arange(len(which))
+        known, rows = steps <= _AS_LONG * meeting.going[which, None], np.arange(len(which))
         in_time = (needs <= steps) & known
         # on the other side of a hole that is ahead of the target, or that it is in
         shut = ~open_
@@ -122,16 +125,16 @@ class Pursuit:
         across = beyond.any(1) & (needs[rows, out] >= steps[out]) & ~near
         near_out = out + np.round(_LATE * (met - out)).astype(np.int64)
         first = np.where(across, np.where(open_[rows, near_out], near_out, out), first)
-        arms.caught_up[which] = np.where(near, arms.caught_up[which] + _EVERY, 0)
+        meeting.caught_up[which] = np.where(near, meeting.caught_up[which] + _EVERY, 0)
         meets = in_time.any(1) & behind | can_meet.any(1) & across
-        meets &= (first > 0) & (arms.caught_up[which] < _CAUGHT_UP * self.rate)
+        meets &= (first > 0) & (meeting.caught_up[which] < _CAUGHT_UP * self.rate)
         # who is at its target does not leave it for a hole ahead; guesses beside one are rough
         there = behind & self.follower.same_goal(arms.p[which], targets)
         meets &= ~(there & (needs[rows, first] >= _FAR * self.rate))
         place = points[rows, first]
-        kept = self.follower.task.gap_of_few(place, arms.meets[which]) < _MOVED
-        arms.meets[which[meets & ~kept]] = place[meets & ~kept]
-        arms.meets[which[~meets]] = np.nan
+        kept = self.follower.task.gap_of_few(place, meeting.place[which]) < _MOVED
+        meeting.place[which[meets & ~kept]] = place[meets & ~kept]
+        meeting.place[which[~meets]] = np.nan
 
     def _needs(self, q: Array, points: Array) -> tuple[Mask, Array]:
         """Which points (A, K, width) are likely open (A, K), and the steps there (A, K) from configurations (A, n)."""

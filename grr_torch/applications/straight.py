@@ -41,7 +41,7 @@ class Straight:
         """
         steps = Steps.none_yet(arms, which)
         ends, known = np.full_like(steps.q, np.nan), lost.copy()
-        ends[lost] = arms.held_q[which[lost]]
+        ends[lost] = arms.hold.q[which[lost]]
         rows = (~lost).nonzero()[0]
         if len(rows):
             points = torch.from_numpy(targets[rows].astype(np.float64))
@@ -52,11 +52,11 @@ class Straight:
         rows = (known & ~direct).nonzero()[0]
         if len(rows):
             chosen, holding = which[rows], lost[rows]
-            goals = np.where(holding[:, None], arms.held[chosen], targets[rows])
+            goals = np.where(holding[:, None], arms.hold.point[chosen], targets[rows])
             lines, found, arms.offsets[chosen] = self._lines(arms, chosen, goals, ends[rows], holding)
-            arms.offset_at[chosen], arms.due[chosen] = goals, np.maximum(arms.due[chosen] - 1, 1)
+            arms.offset_at[chosen], arms.hold.due[chosen] = goals, np.maximum(arms.hold.due[chosen] - 1, 1)
             free = (found | holding) & lines.direct & arms.on_task[chosen]
-            direct[rows], valid[rows] = free, found & (free | ~self.follower.same_goal(goals, arms.barred[chosen]))
+            direct[rows], valid[rows] = free, found & (free | ~self.follower.same_goal(goals, arms.hold.barred[chosen]))
             ends[rows[~holding]] = lines.ends[~holding]
             steps.q[rows[free]], steps.goals[rows[free]] = lines.steps[free], lines.ends[free]
             steps.points[rows[free]] = lines.points[free]
@@ -70,8 +70,10 @@ class Straight:
         """
         if not lost.any():
             return np.zeros_like(lost)
-        there = self.follower.task.gap_of_few(arms.held[which], arms.p[which]) <= self.follower.tolerances.position
-        there &= self.follower.distance(arms.q[which], arms.held_q[which]) <= _NEAR
+        there = (
+            self.follower.task.gap_of_few(arms.hold.point[which], arms.p[which]) <= self.follower.tolerances.position
+        )
+        there &= self.follower.distance(arms.q[which], arms.hold.q[which]) <= _NEAR
         return lost & there & arms.on_task[which]
 
     def _lines(self, arms: Arms, which: Array, goals: Array, guesses: Array, lost: Mask) -> tuple[Lines, Mask, Array]:
@@ -84,7 +86,7 @@ class Straight:
         """
         same = ~lost & self.follower.same_goal(goals, arms.offset_at[which])
         offsets = np.where(same[:, None], arms.offsets[which], 0.0)
-        pace = np.where(lost, 1.0 / arms.due[which], 1.0)
+        pace = np.where(lost, 1.0 / arms.hold.due[which], 1.0)
         stretched = (norms(offsets) > _NEAR).nonzero()[0]
         if len(stretched):
             motion = self.follower.difference(arms.q[which[stretched]], guesses[stretched])

@@ -197,7 +197,7 @@ class Teleoperator:
     def _advance(self, accepted: Mask, targets: Array) -> Command:
         arms = self._arms
         assert arms is not None
-        arms.unchanged += 1
+        arms.meeting.unchanged += 1
         q, goals, points = arms.q.copy(), arms.q.copy(), arms.p.copy()
         codes = np.full(len(targets), HOLDING)
         which = accepted.nonzero()[0]
