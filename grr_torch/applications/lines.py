@@ -12,7 +12,7 @@ from torch import Tensor
 
 from grr_torch.applications.motions import SLACK, Motions
 from grr_torch.pieces import Array, Mask, norms, some
-from grr_torch.projection.continuity import continuous_columns
+from grr_torch.projection.continuity import continuous_columns, usual_bounds
 
 # a line of more pieces is not followed at once
 _MOST_PIECES = 24
@@ -248,9 +248,8 @@ class Follower(Motions):
             first, second = (np.ascontiguousarray(part[rows, columns + end].T) for end in (0, 1))
             return torch.from_numpy(first), torch.from_numpy(second)
 
-        c, epsilon = 0.5 * math.sqrt(self.robot.n), self.epsilon
-        pairs = ends(points), ends(chain)
-        joined = continuous_columns(self.robot, self.task, *pairs, c, epsilon, self.tolerances, _BISECTIONS)
+        pairs, bounds = (ends(points), ends(chain)), usual_bounds(self.robot)
+        joined = continuous_columns(self.robot, self.task, *pairs, *bounds, self.tolerances, _BISECTIONS)
         result = np.ones(len(chain), dtype=bool)
         result[rows[~joined.numpy()]] = False
         return result

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.pieces import FEW, Array, Mask, norms, some
+from grr_torch.projection.continuity import usual_bounds
 from grr_torch.projection.few import project_few
 from grr_torch.projection.project import Tolerances, project_columns
 from grr_torch.robots.robot import Robot
@@ -48,8 +49,8 @@ class Motions:
 
     @property
     def epsilon(self) -> float:
-        """ε of the continuity check: 0.05 √n [rad]."""
-        return 0.05 * math.sqrt(self.robot.n)
+        """ε of the continuity check [rad]."""
+        return usual_bounds(self.robot)[1]
 
     def same_goal(self, first: Array, second: Array) -> Mask:
         """(B,) points (B, width) that are next to others: whoever is on the way to the one is to the other too."""

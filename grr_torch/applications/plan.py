@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from grr_torch.applications.shorten import shorten
 from grr_torch.applications.ways import Stops, Way, WayFinder
 from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
+from grr_torch.projection.continuity import usual_bounds
 from grr_torch.projection.project import point_columns, tool_points
 from grr_torch.spaces.configuration import distance
 
@@ -61,7 +61,7 @@ class Planner:
         Raises:
             ParameterError: The step is out of its range, or no vertex is resolved.
         """
-        epsilon = 0.05 * math.sqrt(roadmap.robot.n)
+        _, epsilon = usual_bounds(roadmap.robot)
         if not _LEAST_STEP <= step <= epsilon:
             raise ParameterError("step", step, f"{_LEAST_STEP:g} to {epsilon:.3g} rad, the ε of the continuity check")
         self.roadmap, self.robot, self.task = roadmap, roadmap.robot, roadmap.task

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from grr_torch.applications.lines import Follower
+from grr_torch.applications.motions import SUBSTEPS
 from grr_torch.spaces.configuration import difference
 
 # configurations on a way at which self-collision is checked; those that are not free at the first few of these are not
@@ -86,6 +87,6 @@ def _leave_contact(follower: Follower, q: Tensor, tries: int) -> Tensor | None:
 
 def never_deeper(follower: Follower, q: Tensor, ends: Tensor) -> Tensor:
     """Whether straight joint-space motions (B, n) stay clear, or lose no clearance where there is none: (B,)."""
-    fractions = torch.arange(9, dtype=q.dtype, device=q.device)[:, None, None] / 8.0
+    fractions = torch.arange(SUBSTEPS + 1, dtype=q.dtype, device=q.device)[:, None, None] / SUBSTEPS
     along = clearance(follower, q + fractions * (ends - q))
     return (along >= along[0].clamp_max(0.0) - 1e-9).all(0)

@@ -54,8 +54,9 @@ def is_continuous(
     Raises:
         ParameterError: Shapes do not fit, an input is not finite, or c ≤ 0.5 or ε ≤ 0.
     """
-    c = 0.5 * math.sqrt(robot.n) if c is None else c
-    epsilon = 0.05 * math.sqrt(robot.n) if epsilon is None else epsilon
+    usual_c, usual_epsilon = usual_bounds(robot)
+    c = usual_c if c is None else c
+    epsilon = usual_epsilon if epsilon is None else epsilon
     if not 0.5 < c < math.inf:
         raise ParameterError("c", c, "above 0.5")
     if not 0.0 < epsilon < math.inf:
@@ -69,6 +70,11 @@ def is_continuous(
     if not bool(q[0].isfinite().all() & q[1].isfinite().all()):
         raise ParameterError("configurations", "NaN or infinite values", "finite values")
     return continuous_columns(robot, task, p, q, c, epsilon, tolerances).reshape(batch)
+
+
+def usual_bounds(robot: Robot) -> tuple[float, float]:
+    """C and ε [rad] of `is_continuous`, as the paper chooses them: 0.5 √n and 0.05 √n."""
+    return 0.5 * math.sqrt(robot.n), 0.05 * math.sqrt(robot.n)
 
 
 def continuous_columns(
