@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from grr_torch.baselines.follower import Follower
+from grr_torch.baselines.reactive_ik import ReactiveIk
 from grr_torch.projection.project import project_columns
 from grr_torch.spaces.configuration import difference
 
 
-class NewtonIk(Follower):
+class NewtonIk(ReactiveIk):
     """Follows targets by pseudo-inverse Newton–Raphson, as in the paper's teleoperation experiment (Section VI-B).
 
     At each step the target is solved from the configuration in which the arm stands, until it converges; the arm then

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from grr_torch.baselines.follower import Follower
+from grr_torch.baselines.reactive_ik import ReactiveIk
 from grr_torch.baselines.relaxed_objective import Past, RelaxedObjective, Weights
 from grr_torch.projection.columns import solve_spd
 from grr_torch.robots.robot import Robot
@@ -21,7 +21,7 @@ _DAMPING, _FALL, _RISE = 1e-4, 0.2, 8.0
 DEFAULT_WEIGHTS = Weights()
 
 
-class RelaxedIk(Follower):
+class RelaxedIk(ReactiveIk):
     """Follows targets by Relaxed IK (Rakita, Mutlu and Gleicher, Robotics: Science and Systems 2018).
 
     At each step a weighted sum of groove losses is minimised from the last configuration: of the tool's position and

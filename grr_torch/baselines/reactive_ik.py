@@ -14,7 +14,7 @@ from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace
 
 
-class Follower(ABC):
+class ReactiveIk(ABC):
     """Arms of one kind that follow a target each, step by step, at a fixed rate.
 
     Joint values are never wrapped: a continuous joint counts its turns.
