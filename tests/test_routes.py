@@ -36,19 +36,19 @@ def test_paths_over_one_roadmap_share_what_is_remembered(planar_roadmap):
     roadmap = replace(planar_roadmap)
     start, goal = (torch.tensor(point, dtype=torch.float64) for point in ([0.3, -0.2], [-0.2, 0.3]))
     first = roadmap.plan(start, goal)
-    asked = Routes.of(roadmap).towards.cache_info()
+    asked = roadmap.routes.towards.cache_info()
     assert asked.misses > 0
     again = roadmap.plan(start, goal)
     assert torch.equal(first.configurations, again.configurations)
-    assert Routes.of(roadmap).towards.cache_info().misses == asked.misses
+    assert roadmap.routes.towards.cache_info().misses == asked.misses
     # no edge that is closed in another roadmap is taken in this one
-    assert Routes.of(replace(roadmap)) is not Routes.of(roadmap)
+    assert replace(roadmap).routes is not roadmap.routes
 
 
 def test_what_is_remembered_is_gone_with_its_roadmap(planar_roadmap):
     roadmap = replace(planar_roadmap)
-    routes = weakref.ref(Routes.of(roadmap))
-    assert routes() is Routes.of(roadmap)
+    routes = weakref.ref(roadmap.routes)
+    assert routes() is roadmap.routes
     del roadmap
     gc.collect()
     assert routes() is None

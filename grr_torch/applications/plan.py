@@ -107,7 +107,7 @@ class Planner:
             return [direct]
         open_edges = self.roadmap.connected.clone()
         for detour in range(_DETOURS):
-            routes = Routes(self.roadmap, open_edges) if detour else Routes.of(self.roadmap)
+            routes = Routes(self.roadmap, open_edges) if detour else self.roadmap.routes
             stops = self._route(start, goal, routes)
             if isinstance(stops, _Refusal):
                 return stops

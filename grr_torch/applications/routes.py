@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from typing import TYPE_CHECKING
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
 _GOALS, _REMEMBERED = 256, 1 << 29
 # of a vertex, a length and the next vertex [bytes]
 _VERTEX = 12
-# routes along all connected edges, by roadmap
-_kept: WeakKeyDictionary[Roadmap, Routes] = WeakKeyDictionary()
 
 
 class Routes:
@@ -54,13 +51,6 @@ class Routes:
         self.part: np.ndarray = connected_components(self._graph, directed=False)[1]
         fitting = _REMEMBERED // (_VERTEX * max(1, vertices))
         self.towards = lru_cache(min(_GOALS, max(1, fitting)))(self._towards)
-
-    @staticmethod
-    def of(roadmap: Roadmap) -> Routes:
-        """Those along all connected edges: made once, and kept as long as the roadmap is."""
-        if roadmap not in _kept:
-            _kept[roadmap] = Routes(roadmap)
-        return _kept[roadmap]
 
     def _towards(self, goal: int, avoided: frozenset[tuple[int, int]] = frozenset()) -> tuple[np.ndarray, np.ndarray]:
         """Shortest paths to a vertex.
@@ -98,6 +88,6 @@ def part_sizes(roadmap: Roadmap) -> list[int]:
 
     There is no path between vertices of different parts.
     """
-    counts = np.bincount(Routes(roadmap).part[roadmap.resolved.numpy()])
+    counts = np.bincount(roadmap.routes.part[roadmap.resolved.numpy()])
     sizes: list[int] = sorted(counts[counts > 0].tolist(), reverse=True)
     return sizes

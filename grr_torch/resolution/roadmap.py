@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from grr_torch.applications.differentiable import DifferentiableSolver
     from grr_torch.applications.path import Path
+    from grr_torch.applications.routes import Routes
     from grr_torch.applications.solve import Solution, Solver
 
 _EDGES_AT_ONCE = 1 << 18
@@ -149,8 +150,7 @@ class Roadmap:
     def uncertified(self) -> tuple[Tensor, Tensor]:
         """Corners (C, 3) and (C, 4) of the triangles and faces inside which the map may not be continuous.
 
-        They are the cells that are not certified, and what would be cells if none of its edges were broken. Roadmap
-        files hold them.
+        Cells that are not certified, and what would be cells if none of its edges were broken; files hold them.
         """
         return doubtful_cells(self)
 
@@ -167,6 +167,13 @@ class Roadmap:
         from grr_torch.applications.differentiable import DifferentiableSolver
 
         return DifferentiableSolver(self)
+
+    @cached_property
+    def routes(self) -> Routes:
+        """Shortest paths along connected edges by D_q, made when they are first needed."""
+        from grr_torch.applications.routes import Routes
+
+        return Routes(self)
 
     def solve(self, points: Tensor, *, differentiable: bool = False, progress: Progress = silent) -> Solution:
         """The map as an IK solver: one configuration for any points of the task space (Section IV-E of the paper).
@@ -264,13 +271,12 @@ class Roadmap:
     def load(path: str | os.PathLike[str], *, device: torch.device | str | None = None) -> Roadmap:
         """Opens a `.grr` file; neither the URDF nor the meshes it was built from are needed.
 
-        The tensors are mapped: of the file, only what is used is read. So what they hold is not checked;
-        `grr-torch info FILE --verify` does that.
+        The tensors are mapped: only what is used is read, and not checked; `grr-torch info FILE --verify` does that.
 
         Args:
             path: The file.
-            device: Where its robot computes, and what is solved comes out; the CPU by default. Its tables stay on the
-                CPU, and so do plans, teleoperation and evaluation.
+            device: Where its robot computes, and what is solved comes out; the CPU by default, where its tables,
+                plans, teleoperation and evaluation stay.
 
         Raises:
             ParameterError: There is no such device.
@@ -283,8 +289,8 @@ class Roadmap:
     def to_networkx(self) -> networkx.Graph[int]:
         """The roadmap as a networkx graph.
 
-        Nodes carry `point` and `configuration` as numpy arrays, edges the `point_distance` D_p and the
-        `configuration_distance` D_q. Only resolved vertices and connected edges are in it.
+        Resolved vertices carry `point` and `configuration` as numpy arrays, connected edges `point_distance` D_p and
+        `configuration_distance` D_q.
 
         Raises:
             ImportError: networkx is not installed.
