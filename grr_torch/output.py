@@ -77,6 +77,11 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         temporary.chmod(0o666 & ~_umask())  # mkstemp makes it private
         os.replace(temporary, path)
+    except OutputError as error:
+        # whoever writes to the temporary name does not know the file's
+        if error.path == temporary:
+            raise OutputError(path, error.reason) from error
+        raise
     except OSError as error:
         raise OutputError(path, str(error.strerror or error)) from error
     finally:

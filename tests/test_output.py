@@ -30,6 +30,15 @@ def test_an_interrupted_write_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_an_error_of_who_writes_names_the_file_itself(tmp_path):
+    path = tmp_path / "file.onnx"
+    with pytest.raises(OutputError, match="apart") as refused, atomic_write(path) as outer, atomic_write(outer):
+        raise OutputError(outer, "what was written is apart from what was to be")
+    assert refused.value.path == path
+    assert str(path) in str(refused.value)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_no_file_is_written_over_another(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     read = tmp_path / "read.txt"
