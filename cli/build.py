@@ -68,6 +68,12 @@ def build(
     samples: Annotated[
         int | None, typer.Option(help="Random configurations of a vertex, for --method random; 100 by default.")
     ] = None,
+    nearest: Annotated[
+        int | None,
+        typer.Option(
+            help="How many of the nearest ones at a neighbouring vertex are tested for each; 6 in the plane, else 2."
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Roadmap file; by default ROBOT.grr. Replaced if it exists.")] = None,
     record: Annotated[Path | None, typer.Option(help="Recording; by default beside the roadmap, .rrd.")] = None,
     no_record: Annotated[bool, typer.Option("--no-record", help="Write no recording.")] = False,
@@ -192,6 +198,7 @@ def build(
                 candidates=candidates,
                 method=method,
                 samples=samples,
+                nearest=nearest,
                 neighbours=neighbours,
                 refine=refine,
                 objectives=weights,

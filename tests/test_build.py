@@ -220,6 +220,8 @@ def test_seed_files_are_read(tmp_path):
         ({"neighbours": 2.5}, "neighbours: got 2.5"),
         ({"samples": 1.5, "method": "random"}, "samples: got 1.5"),
         ({"samples": 9}, 'samples: got 9; valid: none with method "expansion"'),
+        ({"nearest": 3}, 'nearest: got 3; valid: none with method "expansion"'),
+        ({"nearest": 0, "method": "random"}, "nearest: got 0; valid: a whole number, 1 or more"),
         ({"neighbours": 9, "method": "random"}, "neighbours: got 9"),
         ({"candidates": 9, "method": "random"}, "candidates: got 9"),
         ({"candidates": 9}, "candidates: got 9; valid: none with seeds that are given"),

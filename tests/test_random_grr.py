@@ -27,6 +27,15 @@ def test_random_grr_resolves_the_disc_with_continuous_edges(planar_5):
     assert quality.smoothness > grr_torch.build(planar_5, "position", points=150).quality().smoothness
 
 
+def test_more_pairs_tested_leave_fewer_edges_broken(planar_5):
+    few, many = (
+        grr_torch.build(planar_5, "position", points=100, method="random", samples=15, nearest=nearest, refine=False)
+        for nearest in (1, 12)
+    )
+    assert (few.parameters["nearest"], many.parameters["nearest"]) == (1, 12)
+    assert many.connected.sum() > few.connected.sum()
+
+
 def test_a_solvable_problem_is_solved_and_values_are_those_a_variable_has():
     """A ring of variables with few compatible pairs, one assignment of which holds throughout."""
     random = np.random.default_rng(0)

@@ -47,6 +47,7 @@ def build(
     candidates: int | None = None,
     neighbours: int | None = None,
     samples: int | None = None,
+    nearest: int | None = None,
     refine: bool = True,
     objectives: Mapping[str, float] | None = None,
     max_slope: float | None = None,
@@ -77,6 +78,8 @@ def build(
         neighbours: How many of the nearest vertices are averaged over; 24 in the plane and 64 in space by default.
             Where rotation varies, the vertices up to so many edges away, 2 by default.
         samples: Random configurations of a vertex, for the method "random"; 100 by default.
+        nearest: Of each of these, so many of the nearest ones at a neighbouring vertex are tested for continuity, for
+            the method "random"; 6 in the plane and 2 in space by default.
         refine: Whether the roadmap is repaired, relaxed and certified after the expansion.
         objectives: Weights of "clearance", "manipulability" and "limits", which refinement serves besides smoothness;
             at weight 1, 1 % of an objective's mean is worth 1 % of smoothness.
@@ -110,6 +113,7 @@ def build(
         "candidates": candidates,
         "neighbours": neighbours,
         "samples": samples,
+        "nearest": nearest,
         "refine": refine,
         "objectives": dict(objectives or {}),
         "max_slope": problem.max_slope,
@@ -131,7 +135,7 @@ def build(
         with kept.timed("building"):
             work = Work(robot, problem, seed, tolerances, check, progress, kept)
             if method == "random":
-                parts = at_random(work, options["samples"] or SAMPLES)
+                parts = at_random(work, options["samples"] or SAMPLES, options["nearest"])
             else:
                 parts = by_expansion(work, options["neighbours"], options["candidates"] or CANDIDATES)
         settings = {

@@ -56,17 +56,18 @@ class Parts(NamedTuple):
     chosen: dict[str, Any]
 
 
-def at_random(work: Work, samples: int) -> Parts:
-    """Random-GRR, with so many random configurations a vertex."""
+def at_random(work: Work, samples: int, nearest: int | None) -> Parts:
+    """Random-GRR, with so many random configurations a vertex; of each, so many nearest ones beside it are tested."""
     robot, (task, graph, *_) = work.robot, work.problem
+    options: dict[str, Any] = {"samples": samples} | ({} if nearest is None else {"nearest": nearest})
 
     def resolve() -> dict[str, Tensor]:
-        given = robot, task, graph
-        drawn = random_grr(*given, samples=samples, seed=work.seed, tolerances=work.tolerances, progress=work.progress)
+        given = {**options, "seed": work.seed, "tolerances": work.tolerances, "progress": work.progress}
+        drawn = random_grr(robot, task, graph, **given)
         return {"configurations": drawn.configurations, "wave": drawn.wave}
 
     found = work.kept.once("random", resolve)
-    return _checked(work, found["configurations"], found["wave"], {"samples": samples, "seeds": []})
+    return _checked(work, found["configurations"], found["wave"], {**options, "seeds": []})
 
 
 def by_expansion(work: Work, neighbours: int | None, candidates: int) -> Parts:

@@ -25,7 +25,7 @@ from grr_torch.tensor_file import tensor_hash
 from grr_torch.version import __version__
 
 # each method, and which arguments are none of it
-METHODS = {"expansion": ("samples",), "random": ("seeds", "neighbours", "candidates")}
+METHODS = {"expansion": ("samples", "nearest"), "random": ("seeds", "neighbours", "candidates")}
 # of what stages keep, and of how they come to it
 CHECKPOINT_VERSION = 9
 _MOST_STARTS = 100_000
@@ -68,8 +68,9 @@ def check_options(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> 
         if seeds is not None and not isinstance(seeds, str):
             raise ParameterError("candidates", candidates, 'none with seeds that are given; they are for seeds "auto"')
         numbers["candidates"] = check_candidates(candidates)
-    if options["samples"] is not None:
-        numbers["samples"] = check_whole("samples", options["samples"], 1)
+    for name in ("samples", "nearest"):
+        if options[name] is not None:
+            numbers[name] = check_whole(name, options[name], 1)
     if options["neighbours"] is not None:
         numbers["neighbours"] = check_neighbours(task, options["neighbours"])
     _check_problem(robot, task, *(options.get(name) for name in ("points", "bounds", "rotations", "seeds")))
