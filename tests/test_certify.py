@@ -11,6 +11,7 @@ from grr_torch.projection.project import Tolerances
 from grr_torch.resolution import certify as certification
 from grr_torch.resolution.cells import spreads
 from grr_torch.resolution.certify import certify
+from grr_torch.resolution.problem import pose_problem
 from grr_torch.resolution.refine import _network, refine
 
 
@@ -51,6 +52,16 @@ def test_a_second_attempt_leaves_fewer_cells_uncertified(monkeypatch, name, limi
     assert left[1] < left[0]
 
 
+@pytest.mark.parametrize("draw", [1, 5])
+def test_what_is_certified_does_not_hang_on_the_last_digits(draw):
+    kinova = grr_torch.load_robot("kinova")
+    seeds = torch.as_tensor(pose_problem(kinova, "position", None, None, None, None).seeds, dtype=torch.float64)
+    noise = 1e-9 * torch.randn(seeds.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(draw))
+    quality = grr_torch.build(kinova, "position", seeds=seeds + noise).quality()
+    assert quality.triangles_certified >= 0.99
+    assert quality.connected_edges >= 0.998 * 6105
+
+
 def test_what_may_have_to_be_drawn_together_is_measured_again():
     spread = torch.tensor([0.5, 0.93, 1.2, 1.4, 2.0, torch.inf])
     torch.testing.assert_close(certification._leeway(spread, 0.93, 1.4), torch.tensor([0.43, 0.0, 0.0, 0.0, 0.6, 0.0]))
@@ -65,6 +76,7 @@ def test_cells_that_are_not_measured_after_certification_are_certified(planar_5,
         return measured[-1][1]
 
     monkeypatch.setattr(certification, "spreads", noted)
+    monkeypatch.setattr(certification, "_MOST_TWICE", 0)
     refine(plain)
     (before, spread), (after, again) = measured
     assert 0 < len(again) < 0.3 * len(spread)

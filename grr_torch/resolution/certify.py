@@ -24,8 +24,8 @@ _ROUNDS = 18
 # cells with less spread are not looked at [rad]
 _SUSPECT = 0.6
 # the spread that is aimed at, and beyond which a cell is given up [rad]: in a first attempt; in a second one that goes
-# on from there, for maps with more cells left between the limit and 1.1 rad than above; and in one from the beginning,
-# for maps with only a handful left, some of them just beyond what the first gives up
+# on from there, for maps with cells left that it does not give up; and in one from the beginning, instead of that, for
+# maps with only a handful left, some of them just beyond what the first gives up
 _FIRST, _TIGHT, _WIDE = (0.93, 1.4), (0.93, 1.1), (0.93, 1.7)
 _HANDFUL = 16
 # cells of maps that are attempted twice: it takes long
@@ -102,10 +102,10 @@ def certify(
 
 def _second(left: Tensor) -> tuple[float, float] | None:
     """Aim and limit of a second attempt, by the spread of the cells that the first has left; None if there is none."""
-    within = [int((left <= hopeless).sum()) for _, hopeless in (_TIGHT, _FIRST, _WIDE)]
-    if within[0] < within[1] < 2 * within[0]:
-        return _TIGHT
-    return _WIDE if within[1] < within[2] and len(left) <= _HANDFUL else None
+    just_beyond = (left > _FIRST[1]) & (left <= _WIDE[1])
+    if len(left) <= _HANDFUL and bool(just_beyond.any()):
+        return _WIDE
+    return _TIGHT if bool((left <= _TIGHT[1]).any()) else None
 
 
 def _drawn_together(

@@ -27,7 +27,7 @@ from grr_torch.version import __version__
 # each method, and which arguments are none of it
 METHODS = {"expansion": ("samples", "nearest"), "random": ("seeds", "neighbours", "candidates")}
 # of what stages keep, and of how they come to it
-CHECKPOINT_VERSION = 9
+CHECKPOINT_VERSION = 10
 _MOST_STARTS = 100_000
 
 
