@@ -177,7 +177,7 @@ class Follower(Motions):
         solved, reached = self.solved(targets.T, guesses.T)
         ends = solved.T
         (steps, uncut), gaps = self.limited(q, ends), self.distance(q, ends)
-        hits, struck = self.hits(ends[:, None], reached[:, None], q, steps, reached)
+        hits, struck = self.hits(ends[:, None], reached[:, None], q, steps, reached, uncut)
         safe, hit = reached & ~struck, hits[:, 0]
         direct = safe & ~hit & (gaps < _WIDEST * self.epsilon)
         wide = direct & (gaps >= self.epsilon)
@@ -230,7 +230,7 @@ class Follower(Motions):
         whole = aim.short & stepped & reached[:, :-2].all(1) & reached[:, -1]
         whole &= (gaps < np.where(aim.length <= _BRIDGED, _WIDEST, 1.0)[:, None] * self.epsilon).all(1)
         asked = np.concatenate([whole[:, None] & aim.looked[:, :-2], reached[:, -1:]], axis=1)
-        hit, struck = self.hits(chain[:, 1:], asked, q, steps, stepped)
+        hit, struck = self.hits(chain[:, 1:], asked, q, steps, stepped, near & uncut)
         safe = stepped & ~struck
         direct = whole & safe & ~hit.any(1)
         bridged = direct[:, None] & wide

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from grr_torch.pieces import FEW, Array, Mask, norms, some
+from grr_torch.pieces import Array, Mask, norms, some
 from grr_torch.projection.continuity import usual_bounds
 from grr_torch.projection.few import project_few
 from grr_torch.projection.project import Tolerances, project_columns
@@ -19,6 +19,8 @@ from grr_torch.spaces.task import TaskSpace
 
 # configurations between two steps at which self-collision is checked, the second step's own included
 SUBSTEPS = 8
+# up to so many projections at once numpy is faster than pieces that stay in the cache
+_FEW = 800
 # of fewer arms it takes less time to look at all their ways than to find out which ones to look at
 _MANY = 8
 # points no farther apart than this [m] are the same goal
@@ -67,7 +69,7 @@ class Motions:
     def solved(self, points: Array, guesses: Array, iterations: int | None = None) -> tuple[Array, Mask]:
         """`project_columns` for arrays, self-collision left open; in fewer `iterations` than usual, if given."""
         tolerances = self.tolerances if iterations is None else replace(self.tolerances, iterations=iterations)
-        if guesses.shape[1] <= FEW:
+        if guesses.shape[1] <= _FEW:
             return project_few(self.robot, self.task, tolerances, points, guesses)
         columns = torch.from_numpy(points), torch.from_numpy(guesses)
         solved, valid = project_columns(self.robot, self.task, *columns, tolerances, check_collision=False)
@@ -85,7 +87,7 @@ class Motions:
         per_turn, turn = self._turns
         return motion - turn * np.rint(motion * per_turn)
 
-    def hits(self, alone: Array, asked: Mask, q: Array, ends: Array, on_way: Mask) -> tuple[Mask, Mask]:
+    def hits(self, alone: Array, asked: Mask, q: Array, ends: Array, on_way: Mask, there: Mask) -> tuple[Mask, Mask]:
         """Self-collisions of configurations, and of arms on the way from `q` (B, n) to `ends` (B, n).
 
         Args:
@@ -94,19 +96,23 @@ class Motions:
             q: (B, n) where arms are.
             ends: (B, n) where they go.
             on_way: (B,) whose ways are asked for; the others count as struck.
+            there: (B,) whose ways end at the last of the configurations, which is looked at once.
 
         Returns:
             (B, K) configurations in self-collision, and (B,) ways that touch any.
         """
         hit, struck = np.zeros(asked.shape, dtype=bool), ~on_way
-        looked = self._doubtful(q, ends, on_way)
+        looked, there = self._doubtful(q, ends, on_way), there & on_way & asked[:, -1]
+        asked = np.concatenate([asked[:, :-1], (asked[:, -1] & ~there)[:, None]], axis=1)
         between = q[looked, None] + self._substeps * (ends - q)[looked, None]
         every = np.concatenate([alone[asked], between.reshape(-1, q.shape[1])])
         collides = self.robot.few.in_self_collision(np.ascontiguousarray(every.T))
         if some(collides):
             count = len(every) - between.shape[0] * SUBSTEPS
             hit[asked] = collides[:count]
-            struck[looked] = collides[count:].reshape(-1, SUBSTEPS).any(1)
+            ways = collides[count:].reshape(-1, SUBSTEPS)
+            struck[looked] = ways.any(1)
+            hit[looked, -1] |= there[looked] & ways[:, -1]
         return hit, struck
 
     def _doubtful(self, q: Array, ends: Array, on_way: Mask) -> Array:

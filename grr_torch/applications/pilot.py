@@ -17,7 +17,7 @@ from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import Solver
 from grr_torch.applications.steps import DETOURING, HOLDING, TRACKING, UNREACHABLE, Steps
 from grr_torch.applications.straight import Straight
-from grr_torch.pieces import Array, Mask, norms, some
+from grr_torch.pieces import Array, Mask, norms
 
 # vertices that are tried as a way back to the map
 _WAYS_BACK = 32
@@ -62,19 +62,17 @@ class Pilot:
     def steps(self, arms: Arms, which: Array, targets: Array) -> Steps:
         """The next step of some arms (A,) that are given targets (A, width).
 
-        An arm that has just gone straight to its target is likely to do so again: what others have to look at is left
-        out until it cannot.
+        Arms that have just gone straight to their targets are likely to do so again: if all have, what others have to
+        look at is left out until they cannot.
         """
         aims, steps = self.pursuit.aims(arms, which, targets), Steps.none_yet(arms, which)
         arms.turn = not arms.turn
-        rest = ~(arms.tracks[which] & arms.on_task[which])
-        if not rest.all():
-            rows = (~rest).nonzero()[0]
-            made, direct = self.straight.track(arms, which[rows], aims[rows])
+        rows = np.arange(len(which))
+        if (arms.tracks[which] & arms.on_task[which]).all():
+            made, direct = self.straight.track(arms, which, aims)
             steps.put(rows, made)
-            rest[rows] = ~direct
-        if some(rest):
-            rows = rest.nonzero()[0]
+            rows = (~direct).nonzero()[0]
+        if len(rows):
             arms.tracks[which[rows]] = False
             steps.put(rows, self._decided(arms, which[rows], aims[rows]))
             arms.tracks[which[rows]] = steps.codes[rows] == TRACKING

@@ -20,7 +20,7 @@ _OPEN = 0.5
 # points at which a target's way ahead is looked at
 _LOOKED = 25
 # an arm looks in every so many-th step
-_EVERY = 4
+_EVERY = 8
 # a target's motion is its mean over the last so many seconds, and none if it has not moved for longer than that
 _MEAN, _STALE = 0.1, 0.15
 # one that is faster than this [m/s] has leapt, and one that is slower rests
