@@ -277,8 +277,10 @@ def _seeds(arm: Any, seeds: str | None) -> Any:
     """What `build` takes for --seeds."""
     from grr_torch.resolution.seeds import read_seeds
 
-    if seeds == "preset" and arm.preset is None:
-        raise ParameterError("--seeds", "preset", f"auto or a file: {arm.name} has no preset")
+    problems = () if arm.preset is None else arm.preset.problems.values()
+    if seeds == "preset" and not any(len(problem.seeds[0]) == arm.n for problem in problems):
+        reason = "has no preset" if arm.preset is None else "has seeds for all of its joints only"
+        raise ParameterError("--seeds", "preset", f"auto or a file: {arm.name} {reason}")
     if seeds in (None, "preset", "auto"):
         return "auto" if seeds == "auto" else None
     if not Path(seeds).exists() and not Path(seeds).suffix:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from grr_torch.cli.show import finite
 
 if TYPE_CHECKING:
     from grr_torch.resolution.quality import Quality
@@ -37,7 +38,7 @@ def write_figures(file: Path | None, figures: Mapping[str, Any]) -> None:
 
     if file is not None:
         with atomic_write(file) as path:
-            text = json.dumps({"machine": machine(), **figures}, indent=2, ensure_ascii=False)
+            text = json.dumps(finite({"machine": machine(), **figures}), indent=2, ensure_ascii=False, allow_nan=False)
             path.write_text(text, encoding="utf-8")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import threading
 import time
 import warnings
@@ -163,8 +164,17 @@ def _duration(seconds: float) -> str:
 
 
 def print_json(data: dict[str, Any]) -> None:
-    """One object on standard output."""
-    typer.echo(json.dumps(data, indent=2))
+    """One object on standard output; what is no finite number is null, as JSON has no other word for it."""
+    typer.echo(json.dumps(finite(data), indent=2, allow_nan=False))
+
+
+def finite(data: Any) -> Any:
+    """Data for JSON in which all numbers are finite; None stands for others."""
+    if isinstance(data, dict):
+        return {name: finite(value) for name, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [finite(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
 def print_rows(title: str, rows: list[tuple[str, str]]) -> None:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from grr_torch.errors import OutputError, ParameterError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 # files that were not finished
 PARTIAL = ".*.partial.*"
@@ -20,16 +27,17 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     Raises:
         OutputError: Its folder is missing or not writable, or it is there and no regular file.
     """
-    path = Path(path)
+    path, target = Path(path), Path(os.path.realpath(path))
     try:
-        if path.is_dir():
+        if target.is_dir():
             raise OutputError(path, "it is a folder")
-        if path.exists() and not path.is_file():
+        if target.exists() and not target.is_file():
             raise OutputError(path, "it exists and is not a regular file")
-        if not path.parent.is_dir():
-            raise OutputError(path, f"folder '{path.parent}' does not exist")
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
+        if not target.parent.is_dir():
+            raise OutputError(path, f"folder '{target.parent}' does not exist")
+        handle, name = _temporary(target)
+        os.close(handle)
+        os.unlink(name)
     except OSError as error:
         raise OutputError(path, str(error.strerror)) from error
 
@@ -70,7 +78,10 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     path = Path(os.path.realpath(path))  # a link stays one: what it points to is replaced
     check_writable(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=f".partial{path.suffix}", dir=path.parent)
+    try:
+        handle, name = _temporary(path)
+    except OSError as error:
+        raise OutputError(path, str(error.strerror or error)) from error
     os.close(handle)
     temporary = Path(name)
     try:
@@ -86,6 +97,48 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise OutputError(path, str(error.strerror or error)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def lock_folder(folder: Path, who: str) -> int | None:
+    """A handle that keeps others out of a folder until it is closed, be it by the end of the process.
+
+    Args:
+        folder: The folder.
+        who: What the others are called, in the singular.
+
+    Returns:
+        The handle; None where there are no locks.
+
+    Raises:
+        OutputError: Another one has it.
+    """
+    if fcntl is None:
+        return None
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(handle)
+        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+            return None  # not every file system knows locks
+        raise OutputError(
+            folder, f"another {who} is using it; valid: another folder, or to wait for its end"
+        ) from error
+    return handle
+
+
+def remove_partial(folder: Path) -> None:
+    """Removes what was left half written in a folder, by something that was killed."""
+    for path in folder.glob(PARTIAL):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _temporary(path: Path) -> tuple[int, str]:
+    """Handle and name of a new file beside another one."""
+    return tempfile.mkstemp(prefix=f".{path.name}.", suffix=f".partial{path.suffix}", dir=path.parent)
 
 
 def _umask() -> int:

@@ -30,7 +30,7 @@ def read_text(path: Path, names: Sequence[str] | None) -> Iterator[Array]:
             return
         delimiter = next((mark for mark in _DELIMITERS if mark in first), ",")
         cells = [cell.strip() for cell in next(csv_rows([_parted(first, delimiter)], delimiter=delimiter))]
-        header = not all(map(_is_number, cells))
+        header = _is_header(path, cells, names)
         if not header:
             _check_width(path, len(cells), names)
         # columns that are not wanted may share a name
@@ -59,6 +59,8 @@ def read_parquet(path: Path, names: Sequence[str] | None) -> Iterator[Array]:
     file = parquet.ParquetFile(path)
     found = file.schema_arrow.names
     wanted = [found[k] for k in _wanted(path, found, names)]
+    if any(found.count(name) > 1 for name in wanted):
+        raise FileFormatError(path, f"has columns named {', '.join(found)}; valid: names that differ")
     for name in wanted:
         kind = file.schema_arrow.field(name).type
         if not (types.is_floating(kind) or types.is_integer(kind)):
@@ -102,6 +104,19 @@ def _wanted(path: Path, found: Sequence[str], names: Sequence[str] | None) -> li
         valid = f"each of {', '.join(names)} once, or none of them and {len(names)} columns"
         raise FileFormatError(path, f"has columns named {', '.join(found)}; valid: {valid}")
     return chosen
+
+
+def _is_header(path: Path, cells: Sequence[str], names: Sequence[str] | None) -> bool:
+    """Whether the first line says what the columns are: it has a wanted name, or no number."""
+    wanted = {name.casefold() for name in names or ()}
+    texts = [cell for cell in cells if not _is_number(cell)]
+    if not texts or wanted & {cell.casefold() for cell in cells}:
+        return bool(texts)
+    if any(map(_is_number, filter(None, cells))):
+        raise FileFormatError(
+            path, f"row 1 holds {', '.join(map(repr, texts))}; valid: numbers, or a header without any"
+        )
+    return True
 
 
 def _check_width(path: Path, width: int, names: Sequence[str] | None) -> None:

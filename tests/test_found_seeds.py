@@ -153,3 +153,11 @@ def test_a_flat_graph_in_space_needs_no_seeds(kinova):
     points = torch.cat([sheet.points, torch.full((len(sheet.points), 1), 0.4, dtype=torch.float64)], dim=1)
     graph = grr_torch.TaskGraph(points, sheet.edges)
     assert int(grr_torch.build(kinova, "position", points=graph, seeds="auto").resolved.sum()) > 50
+
+
+def test_a_bundled_robot_with_a_joint_held_finds_its_own_seeds():
+    robot = grr_torch.load_robot("kinova", held_joints={"joint_3": 0.0})
+    roadmap = grr_torch.build(robot, points=400)
+    assert roadmap.parameters["seeds"] == "auto"
+    assert roadmap.parameters["max_slope"] is None
+    assert roadmap.resolved.any()

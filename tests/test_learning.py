@@ -207,6 +207,10 @@ def test_a_state_of_another_training_is_not_resumed(planar_roadmap, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         train_ik(planar_roadmap, SMALL, out=out, on_epoch=stop)
+    state = checkpoint_path(out).read_bytes()
+    with pytest.raises(OutputError, match="a state of a training is there; valid: another file .*; --resume"):
+        train_ik(planar_roadmap, SMALL, out=out)
+    assert checkpoint_path(out).read_bytes() == state
     with pytest.raises(FileFormatError, match="learning rate"):
         train_ik(planar_roadmap, replace(SMALL, learning_rate=1e-4), out=out, resume=True)
     with pytest.raises(ParameterError, match="resume"):

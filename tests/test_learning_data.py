@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 import grr_torch
 from grr_torch import RoadmapDataset, Split
 from grr_torch.learning.encoding import Encoding
-from grr_torch.learning.region import certified_region
+from grr_torch.learning.region import Region, certified_region
 from grr_torch.learning.split import SPLITS
 from grr_torch.spaces.configuration import distance
 
@@ -87,6 +87,15 @@ def test_points_are_uniform_over_the_region(planar_roadmap, generator):
     expected = float(region.volumes[left].sum() / region.volumes.sum())
     inside = grr_torch.learning.region.Region(region.corners[left], region.volumes[left]).contains(points)
     assert abs(float(inside.double().mean()) - expected) < 0.01
+
+
+def test_points_are_drawn_by_volume():
+    corners = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[5.0, 5.0], [8.0, 5.0], [5.0, 6.0]]])
+    region = Region(corners.double(), torch.tensor([0.5, 1.5], dtype=torch.float64))
+    points = region.draw(20_000, torch.Generator().manual_seed(0))
+    second = points[:, 0] > 3.0
+    assert abs(float(second.double().mean()) - 0.75) < 0.01
+    torch.testing.assert_close(points[second].mean(0), corners[1].double().mean(0), atol=0.03, rtol=0.0)
 
 
 @pytest.mark.parametrize("samples", [None, 5000])

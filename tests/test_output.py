@@ -7,7 +7,7 @@ import resource
 import pytest
 
 from grr_torch.errors import GrrError, OutputError, ParameterError
-from grr_torch.output import atomic_write, check_outputs
+from grr_torch.output import atomic_write, check_outputs, remove_partial
 
 
 def interrupt(temporary, error):
@@ -63,6 +63,26 @@ def test_an_unwritable_output_is_a_clear_error(planar_roadmap, tmp_path):
     with pytest.raises(OutputError, match="it is a folder"):
         planar_roadmap.save(tmp_path)
     assert issubclass(OutputError, GrrError)
+
+
+def test_what_cannot_be_written_is_known_before_the_work(tmp_path):
+    with pytest.raises(OutputError, match="File name too long"):
+        check_outputs({"--out": tmp_path / (240 * "b" + ".csv")})
+    (tmp_path / "link.csv").symlink_to(tmp_path / "none" / "file.csv")
+    with pytest.raises(OutputError, match="folder '.*none' does not exist"):
+        check_outputs({"--out": tmp_path / "link.csv"})
+    with pytest.raises(OutputError, match="File name too long"), atomic_write(tmp_path / (240 * "b")):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["link.csv"]
+
+
+def test_what_was_left_half_written_is_removed(tmp_path):
+    (tmp_path / ".map.grr.abc.partial.grr").write_text("half")
+    (tmp_path / ".arrays.abc.partial.npz").mkdir()
+    (tmp_path / ".arrays.abc.partial.npz" / "q.npy").write_text("half")
+    (tmp_path / "map.grr").write_text("whole")
+    remove_partial(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["map.grr"]
 
 
 def test_a_full_disk_is_a_clear_error_and_leaves_the_old_file(planar_roadmap, tmp_path):

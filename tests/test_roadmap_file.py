@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 
 import grr_torch
 from grr_torch.errors import FileFormatError
+from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.roadmap_file import roadmap_hash
 from grr_torch.resolution.verify import verify_file
 from grr_torch.robots.urdf_json import urdf_from_json, urdf_to_json
@@ -275,3 +276,13 @@ def test_maps_go_by_the_same_name_whether_or_not_they_know_what_is_reachable(pla
     assert roadmap_hash(plain) == roadmap_hash(asked)
     other = grr_torch.build(planar_5, "position", points=100, refine=False)
     assert roadmap_hash(other) != roadmap_hash(plain)
+
+
+def test_numbers_of_numpy_are_saved_as_numbers(tmp_path):
+    robot = grr_torch.load_robot("planar_5", held_joints={"joint_2": np.float32(0.5)})
+    numbers = {"max_slope": np.float32(50.0), "tolerances": Tolerances(position=np.float32(1e-4))}
+    roadmap = grr_torch.build(robot, "position", points=40, refine=False, **numbers)
+    roadmap.save(tmp_path / "map.grr")
+    again = grr_torch.Roadmap.load(tmp_path / "map.grr")
+    assert again.robot.held_joints == {"joint_2": 0.5}
+    assert again.parameters["max_slope"] == 50.0

@@ -219,6 +219,23 @@ def test_a_model_survives_its_file(kinova, tmp_path):
     assert SphereModel.parse(tiny.to_yaml(), ["a", "b"], source="tiny") == tiny
 
 
+def test_a_model_of_numpy_numbers_survives_its_text():
+    model = SphereModel({"a": (Sphere(tuple(np.array([0.1, 0.0, 1e-7])), np.float64(0.5)),)}, frozenset())
+    assert SphereModel.parse(model.to_yaml(), ["a"], source="text") == model
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "collision_spheres:\n  a: [{center: [0, 0, 0], radius: 1}]\n  a: [{center: [1, 0, 0], radius: 1}]\n",
+        "collision_spheres: {a: []}\nself_collision_ignore: {a: [b], a: [c]}\n",
+    ],
+)
+def test_a_link_given_twice_is_refused(text):
+    with pytest.raises(FileFormatError, match="'a' is given twice"):
+        SphereModel.parse(text, ["a", "b", "c"], source="text")
+
+
 def test_names_that_yaml_takes_for_something_else_survive():
     names = ["on", "No", "y", "null", "True", "~", "1e5", "0x1F", "1_0", "é", "a: b", "a#b", 'a"b', "a\\b", "a\tb", "-"]
     spheres = {name: (Sphere((0.0, 0.0, 1.0), 0.5),) for name in names}

@@ -65,6 +65,12 @@ def test_what_determines_a_roadmap_changes_the_hash(tmp_path):
     assert len({one_hash(tmp_path, text) for text in said}) == len(said)
 
 
+def test_a_sweep_can_ask_for_no_bound_of_slopes(tmp_path):
+    orders = orders_of(tmp_path, "defaults: {robot: kinova}\ngrid: {max_slope: [null, .inf, 12]}")
+    assert [order.options.get("max_slope") for order in orders] == [None, float("inf"), 12.0]
+    assert len({order.hash for order in orders}) == 3
+
+
 def test_files_count_by_what_is_in_them(tmp_path):
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.urdf").write_text(BOX_ARM if name != "c" else BOX_ARM.replace("0.3", "0.31"))
@@ -122,6 +128,13 @@ def test_files_count_by_what_is_in_them(tmp_path):
         ("builds: [", "is not YAML"),
         ("builds: [!!python/object/apply:os.getcwd []]", "is not YAML"),
         ("{1: 2}", "1 is no name"),
+        ("grid: !!map [1, 2]", "is not YAML"),
+        ("defaults: {refine: !!bool maybe}", "is not YAML"),
+        ("[" * 3000, "is not YAML"),
+        (f"builds: [{{robot: planar_5, seed: {'9' * 401}}}]", "seed: got 999"),
+        ("builds: [{robot: planar_5, margin: .inf}]", "margin: got inf"),
+        ("builds: [{robot: planar_5, needs: {gpus: 1.5}}]", "needs: gpus: got 1.5; valid: 0, a share of one"),
+        ("builds: [{robot: planar_5, needs: {gpus: 0.00001}}]", "needs: gpus: got 1e-05"),
         ("", "is not a sweep"),
         ("defaults: {robot: planar_5}", "asks for 0 builds"),
         (f"grid: {{seed: {list(range(400))}, points: {list(range(400))}}}", "asks for 160,000 builds"),
@@ -218,9 +231,9 @@ def test_two_sweeps_in_one_folder_exclude_each_other(fleet, tmp_path):
         run_sweep([order], folder, LocalEngine())
 
     rows = run_sweep(orders[:1], tmp_path, LocalEngine(second))
-    assert "another sweep is at work there" in rows[0]["error"]
+    assert "another sweep is using it" in rows[0]["error"]
     with pytest.raises(OutputError, match="cannot write"):
-        run_sweep(orders[:1], tmp_path / ".lock" / "under a file", LocalEngine())
+        run_sweep(orders[:1], tmp_path / "catalogue.parquet" / "under a file", LocalEngine())
 
 
 def test_an_interrupt_leaves_what_is_done_and_a_true_catalogue(fleet, tmp_path):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 
 import numpy as np
+import pyarrow
 import pytest
 from grr_torch.cli.show import show_table
+from pyarrow import parquet
 
 from grr_torch.errors import FileFormatError, ParameterError
 from grr_torch.resolution.seeds import read_seeds
@@ -54,6 +56,20 @@ def test_columns_are_found_by_name_in_every_kind_of_file(tmp_path):
         np.testing.assert_array_equal(piece, values[:, [2, 0]])
         with pytest.raises(FileFormatError, match="has columns named B, note #1, A; valid: each of a, c once"):
             list(read_points(file, 2, ("a", "c")))
+
+
+@pytest.mark.parametrize("first", ["0.1,O.2", "0.1,NA", "a,0.2", "0.1,"])
+def test_a_first_row_with_a_bad_value_is_no_header(tmp_path, first):
+    (tmp_path / "p.csv").write_text(f"{first}\n0.3,0.4\n")
+    with pytest.raises(FileFormatError, match="row 1 holds"):
+        list(read_points(tmp_path / "p.csv", 2))
+
+
+def test_a_parquet_file_whose_columns_share_a_name_is_refused(tmp_path):
+    columns = [pyarrow.array([0.1, 0.2]), pyarrow.array([0.3, 0.4])]
+    parquet.write_table(pyarrow.Table.from_arrays(columns, names=["a", "a"]), tmp_path / "p.parquet")
+    with pytest.raises(FileFormatError, match="has columns named a, a; valid: names that differ"):
+        list(read_points(tmp_path / "p.parquet", 2))
 
 
 def test_what_is_wrong_is_said_wherever_in_a_long_file_it_is(tmp_path):

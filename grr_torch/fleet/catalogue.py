@@ -157,7 +157,7 @@ def _failed(path: Path) -> Row | None:
         told = json.loads(path.read_text(encoding="utf-8"))
         blank = dict.fromkeys(_FIGURES)
         return {**_order_columns(told), "status": "failed", "error": told["error"], **blank, "file": None}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         warnings.warn(f"left out of the catalogue: {path}: cannot be used: {error}", GrrWarning, stacklevel=3)
         return None
 

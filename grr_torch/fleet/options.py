@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import sys
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ _NOT_NAMED = {
     *("tolerances", "check", "checkpoint", "resume", "progress"),
 }
 _RENAMED = {"rpy": "rotation"}
+# whole numbers beyond it are none that a float holds
+_LARGEST = sys.float_info.max
 _SIMPLE = {bool: "true or false", int: "a whole number", float: "a number", str: "text", types.NoneType: "null"}
 
 
@@ -64,6 +67,8 @@ def check_option(name: str, value: Any) -> Any:
     if name not in options:
         raise UnknownNameError("option of a build", name, tuple(options))
     hint = options[name].hint
+    if name == "max_slope" and value == math.inf:
+        return value  # no bound, where null is that of the preset
     if not _fits(value, hint):
         raise ParameterError(name, repr(value), _describe(hint))
     return _floats(value, top=_takes(hint, float) and not _takes(hint, int))
@@ -92,8 +97,9 @@ def _fits_one(value: Any, hint: Any) -> bool:
     if origin in (bool, str, types.NoneType):
         return isinstance(value, origin)
     if origin in (int, float):
-        number = isinstance(value, int if origin is int else int | float) and not isinstance(value, bool)
-        return number and math.isfinite(value)
+        if not isinstance(value, int if origin is int else int | float) or isinstance(value, bool):
+            return False
+        return -_LARGEST <= value <= _LARGEST
     if not isinstance(origin, type) or not issubclass(origin, Mapping | Sequence):
         return False  # a tensor, a graph, a path: none that a file could hold as such
     inside = [part for part in get_args(hint) if part is not Ellipsis]

@@ -23,6 +23,8 @@ from grr_torch.version import __version__
 
 # hexadecimal digits of a hash that name a file
 _DIGITS = 16
+# of a GPU
+_LEAST_SHARE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,9 @@ class Needs:
             number = isinstance(value, int | float) and not isinstance(value, bool)
             if not number or not math.isfinite(value) or value < least:
                 raise ParameterError(f"needs: {name}", repr(value), f"a number of {least:g} or more")
+        if (self.gpus > 1.0 and self.gpus != int(self.gpus)) or 0.0 < self.gpus < _LEAST_SHARE:
+            valid = f"0, a share of one from {_LEAST_SHARE:g} on, or a whole number, as Ray counts them"
+            raise ParameterError("needs: gpus", self.gpus, valid)
 
     @staticmethod
     def of(data: Any) -> Needs:
@@ -180,7 +185,7 @@ def _digest(robot: Robot, task: TaskSpace, options: Mapping[str, Any]) -> str:
         "device": options.get("device", "cpu"),
         "options": said,
     }
-    text = json.dumps(what, sort_keys=True, allow_nan=False)
+    text = json.dumps(what, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:_DIGITS]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from grr_torch.errors import OutputError
 from grr_torch.fleet.catalogue import CATALOGUE, Row, forget_failure, is_there, record_failure, write_catalogue
 from grr_torch.fleet.order import Order
 from grr_torch.fleet.work import Work, make_roadmap
-from grr_torch.output import PARTIAL, check_writable
+from grr_torch.output import check_writable, lock_folder, remove_partial
 from grr_torch.progress import Progress, silent
 
 # told of each order that ended, and why it failed, or None
@@ -105,14 +106,10 @@ def _alone(folder: Path) -> Iterator[None]:
     Raises:
         OutputError: Another one is at work there.
     """
-    import fcntl
-
-    with (folder / ".lock").open("w") as file:
-        try:
-            # the system lets go of it however this process ends
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise OutputError(folder, "another sweep is at work there") from error
-        for path in folder.glob(PARTIAL):
-            path.unlink(missing_ok=True)
+    handle = lock_folder(folder, "sweep")
+    try:
+        remove_partial(folder)
         yield
+    finally:
+        if handle is not None:
+            os.close(handle)

@@ -67,8 +67,9 @@ def _read_yaml(path: Path) -> Any:
         return yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)  # a safe loader
     except OSError as error:
         raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, ValueError) as error:
-        raise FileFormatError(path, f"is not YAML that can be used: {' '.join(str(error).split())}") from error
+    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise FileFormatError(path, f"is not YAML that can be used: {reason}") from error
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml comes without types

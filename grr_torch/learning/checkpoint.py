@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import save_file
 from torch import Tensor
 
 from grr_torch.errors import FileFormatError
-from grr_torch.output import atomic_write
-from grr_torch.tensor_file import read_tensor_file, tensors_hash
+from grr_torch.tensor_file import read_tensor_file, tensors_hash, write_tensors
 
 FORMAT = "grr-torch training"
 FORMAT_VERSION = 1
@@ -44,11 +42,10 @@ class Checkpoint:
         Raises:
             OutputError: It cannot be written.
         """
-        kept = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
+        kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
         header = {"format": FORMAT, "format_version": FORMAT_VERSION, "tensors_sha256": tensors_hash(kept)}
         metadata = {**header, **progress, **self.identity}
-        with atomic_write(self.path) as temporary:
-            save_file(kept, temporary, metadata={key: json.dumps(value) for key, value in metadata.items()})
+        write_tensors(self.path, kept, {key: json.dumps(value) for key, value in metadata.items()})
 
     def load(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """Reads a state: its metadata and tensors.

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import ParameterError, check_whole
 from grr_torch.learning.refine import newton_steps
 from grr_torch.learning.region import Region, certified_region
 from grr_torch.learning.split import SPLITS, Split
@@ -179,8 +179,7 @@ def draw_part(
     Raises:
         ParameterError: The part has none, or the count is not valid.
     """
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ParameterError("points", count, "1 or more")
+    count = check_whole("points", count, 1)
     splitter = split.of(roadmap)
     found: list[Tensor] = []
     for _ in range(_MOST_DRAWS + count // _DRAWN):

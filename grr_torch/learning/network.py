@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import check_whole
 from grr_torch.learning.encoding import Encoding
 
 # standard deviation of the waves' first wave numbers, where the roadmap's longest side is 2
@@ -33,9 +33,7 @@ class Architecture:
 
     def __post_init__(self) -> None:
         for name, least in (("width", 1), ("depth", 1), ("waves", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 1 << 14:
-                raise ParameterError(name, value, f"a whole number from {least} to {1 << 14}")
+            object.__setattr__(self, name, check_whole(name, getattr(self, name), least, 1 << 14))
 
     def to_dict(self) -> dict[str, Any]:
         """For metadata."""

@@ -10,20 +10,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from grr_torch.errors import FileFormatError, GrrError, ParameterError
 from grr_torch.learning.network import Architecture, IkNetwork
 from grr_torch.learning.refine import newton_steps
-from grr_torch.output import atomic_write
 from grr_torch.pieces import one_thread, together
 from grr_torch.projection.project import Tolerances, point_columns
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.roadmap_file import roadmap_hash
 from grr_torch.robots.robot import Robot
 from grr_torch.spaces.task import TaskSpace, task_from_json
-from grr_torch.tensor_file import read_tensor_file, tensors_hash
+from grr_torch.tensor_file import read_tensor_file, tensors_hash, write_tensors
 from grr_torch.version import __version__
 
 FORMAT = "grr-torch neural IK"
@@ -191,8 +189,7 @@ def save_network(path: str | os.PathLike[str], network: IkNetwork, origin: Origi
         "origin": origin.to_dict(),
         "tensors_sha256": tensors_hash(tensors),
     }
-    with atomic_write(path) as temporary:
-        save_file(tensors, temporary, metadata={key: json.dumps(value) for key, value in metadata.items()})
+    write_tensors(path, tensors, {key: json.dumps(value) for key, value in metadata.items()})
 
 
 def load_network(path: str | os.PathLike[str]) -> tuple[IkNetwork, Origin]:

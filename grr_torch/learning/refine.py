@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import ParameterError, check_whole
 from grr_torch.pieces import in_pieces
 from grr_torch.projection.columns import damped_least_squares
 from grr_torch.projection.project import Tolerances, point_columns
@@ -39,8 +39,7 @@ def newton_steps(
     Raises:
         ParameterError: Shapes do not fit, a value is not finite, or `steps` is negative.
     """
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 0:
-        raise ParameterError("steps", steps, "0 or more")
+    steps = check_whole("steps", steps, 0)
     targets, q = point_columns(robot, task, points), robot.columns(guesses)
     if points.shape[:-1] != guesses.shape[:-1]:
         raise ParameterError("points and guesses", (tuple(points.shape), tuple(guesses.shape)), "equal batch shapes")

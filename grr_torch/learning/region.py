@@ -39,7 +39,9 @@ class Region:
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """Points (count, d), uniform over the region [m]."""
-        chosen = torch.multinomial(self.volumes, count, replacement=True, generator=generator)
+        # multinomial takes no more than 2^24 of them
+        share = torch.rand(count, dtype=torch.float64, generator=generator)
+        chosen = torch.searchsorted(self._sums, share * self._sums[-1], right=True).clamp_max(len(self._sums) - 1)
         # the exponential law makes barycentric coordinates uniform
         weights = -torch.rand(count, self.corners.shape[1], 1, dtype=torch.float64, generator=generator).log()
         return (self.corners[chosen] * weights).sum(1) / weights.sum(1)
@@ -54,6 +56,11 @@ class Region:
             shares = (inverse[simplices] @ offsets[..., None])[..., 0]
             inside |= (shares >= -1e-9).all(1) & (shares.sum(1) <= 1.0 + 1e-9)
         return inside
+
+    @cached_property
+    def _sums(self) -> Tensor:
+        """(S,) sums of the volumes up to each."""
+        return self.volumes.cumsum(0)
 
     @cached_property
     def _tables(self) -> tuple[cKDTree, Tensor]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError, check_seed
+from grr_torch.errors import ParameterError, check_seed, check_whole
 from grr_torch.learning.region import certified_region
 from grr_torch.learning.split import Split
 from grr_torch.progress import Progress, silent
@@ -61,8 +61,7 @@ def draw_samples(
     Raises:
         ParameterError: The count is not valid, or no cell is certified.
     """
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ParameterError("samples", count, "1 or more")
+    count = check_whole("samples", count, 1)
     generator = torch.Generator().manual_seed(check_seed(seed))
     region, splitter = certified_region(roadmap, progress), split.of(roadmap)
     for start in range(0, count, PIECE):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError, TrainingError
+from grr_torch.errors import OutputError, ParameterError, TrainingError
 from grr_torch.learning.checkpoint import Checkpoint, checkpoint_path
 from grr_torch.learning.dataset import RoadmapDataset
 from grr_torch.learning.loss import IkLoss, Loss
@@ -65,7 +65,7 @@ def train_ik(
     Raises:
         ParameterError: The roadmap has too few resolved vertices or no certified cells, a part has no samples, or
             `resume` without `out`.
-        OutputError: `out` cannot be written.
+        OutputError: `out` cannot be written, or the state of a training is there without `resume`.
         FileFormatError: The state to resume from is missing, or of another training.
         TrainingError: The loss is not finite.
     """
@@ -80,6 +80,9 @@ def train_ik(
         check_weights_path("out", out)
     identity = {"options": options.to_dict(), "origin": Origin.of(roadmap, {}).to_dict()}
     checkpoint = None if out is None else Checkpoint(checkpoint_path(out), identity)
+    if checkpoint is not None and not resume and checkpoint.path.exists():
+        valid = "another file to write; --resume to go on from there; or to remove it"
+        raise OutputError(checkpoint.path, f"a state of a training is there; valid: {valid}")
     state = checkpoint.load() if checkpoint is not None and resume else None
     if dataset is None:
         dataset = RoadmapDataset(roadmap, options.samples, split=options.parted(), seed=options.seed, progress=progress)

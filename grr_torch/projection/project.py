@@ -52,6 +52,7 @@ class Tolerances:
         for name in ("position", "rotation"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise ParameterError(f"{name} tolerance", getattr(self, name), "above 0")
+            object.__setattr__(self, name, float(getattr(self, name)))
         object.__setattr__(self, "iterations", check_whole("iterations", self.iterations, 1))
 
 

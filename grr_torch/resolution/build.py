@@ -107,7 +107,7 @@ def build(
         OutputError: The checkpoint cannot be written, is there without `resume`, or another build is using it.
     """
     problem = pose_problem(robot, task, points, bounds, seeds, rotations)
-    problem = bounded(problem, max_slope, method)
+    problem = bounded(problem, None if max_slope is None else float(max_slope), method)
     options: dict[str, Any] = {
         "method": method,
         "candidates": candidates,

@@ -7,7 +7,6 @@ the build is finished, its roadmap (`roadmap.grr`) takes their place.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -27,7 +26,7 @@ except ImportError:  # where there are no POSIX locks, two builds in one folder 
     fcntl = None  # type: ignore[assignment]
 
 from grr_torch.errors import FileFormatError, GrrWarning, OutputError
-from grr_torch.output import PARTIAL, atomic_write
+from grr_torch.output import PARTIAL, atomic_write, lock_folder, remove_partial
 from grr_torch.tensor_file import read_tensors, tensor_hash, write_tensors
 
 # a stage that is under way is written no sooner after the last time [s]
@@ -172,7 +171,7 @@ class Checkpoint:
     def _open(self, folder: Path, build: dict[str, Any], resume: bool) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(folder)
+            self._lock = lock_folder(folder, "build")
             partial = set(folder.glob(PARTIAL))  # of a run that was killed
             present = sorted(path.name for path in folder.iterdir() if path not in partial)
         except OSError as error:
@@ -184,8 +183,7 @@ class Checkpoint:
         if not resume:
             raise OutputError(folder, "it is not empty; valid: another folder, or --resume to go on from what is there")
         _check_build(folder / _BUILD, build)
-        for path in partial:
-            path.unlink(missing_ok=True)
+        remove_partial(folder)
         if _ROADMAP in present:
             self.roadmap = folder / _ROADMAP
             _read_whole(self.roadmap)
@@ -203,25 +201,6 @@ class Checkpoint:
                 warnings.warn(f"{error}; going on from {paths[len(self._found) - 1].name}", GrrWarning, stacklevel=4)
                 return
             self._found[path.name], self._seconds = tensors, json.loads(metadata["seconds"])
-
-
-def _locked(folder: Path) -> int | None:
-    """A handle that keeps other builds out of a folder until it is closed, be it by the end of the process.
-
-    Raises:
-        OutputError: Another build has it.
-    """
-    if fcntl is None:
-        return None
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(handle)
-        if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-            return None  # not every file system knows locks
-        raise OutputError(folder, "another build is using it; valid: another folder, or to wait for its end") from error
-    return handle
 
 
 def _read_whole(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:

@@ -171,8 +171,10 @@ def _complete(
         if given is not None and isinstance(points, kind_of):
             raise ParameterError(name, given, f"none with a graph given as points, which has its own {name}")
     graph = points if isinstance(points, TaskGraph) else _grid(robot, task, points, bounds, problem)
+    # the preset's seeds and bound are those of all its joints
+    whole = problem is not None and all(len(seed) == robot.n for seed in problem.seeds)
     if seeds is None:
-        seeds = "auto" if problem is None else problem.seeds
+        seeds = problem.seeds if problem is not None and whole else "auto"
     if isinstance(seeds, str) and seeds != "auto":
         raise UnknownNameError("seeds", seeds, ("auto",), " Or a table of configurations.")
     if not isinstance(task, TaskSpace):
@@ -182,7 +184,7 @@ def _complete(
         graph = _turned(task, graph, rotations, problem)
     if graph.points.shape[1] != task.width:
         raise ParameterError("points", f"{graph.points.shape[1]} coordinates", f"{task.width} for {task.name}")
-    if problem is None or problem.max_slope is None or not _is_grid_of(graph, problem):
+    if problem is None or not whole or problem.max_slope is None or not _is_grid_of(graph, problem):
         return Problem(task, graph, seeds)
     return Problem(task, graph, seeds, problem.max_slope, problem.connectivity)
 

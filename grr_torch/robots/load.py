@@ -176,7 +176,7 @@ def _held(urdf: Urdf, held_joints: Mapping[str, float]) -> dict[str, float]:
         joint = urdf.joints[name]
         if not math.isfinite(value) or not joint.lower <= value <= joint.upper:
             raise ParameterError(f"held joint '{name}'", value, f"{joint.lower} to {joint.upper}")
-    return dict(held_joints)
+    return {name: float(value) for name, value in held_joints.items()}
 
 
 def _check_types(urdf: Urdf, path: Sequence[Joint]) -> None:

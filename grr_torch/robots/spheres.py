@@ -8,6 +8,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,7 @@ class SphereModel:
         import yaml
 
         try:
-            data = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+            data = yaml.load(text, Loader=_loader())
         except (yaml.YAMLError, ValueError, OverflowError) as error:
             raise FileFormatError(source, f"is not YAML: {' '.join(str(error).split())}") from error
         for outer in ("robot_cfg", "kinematics"):  # cuRobo nests both entries in these
@@ -127,13 +128,31 @@ class SphereModel:
         return SphereModel(spheres, frozenset(ignored))
 
 
+@cache
+def _loader() -> Any:
+    """YAML's safe loader, which refuses what it else lets pass: one key twice, of which only the last would count."""
+    import yaml
+
+    class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # yaml comes without types
+        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            found = set()
+            for key, _ in node.value:
+                if key.value in found:
+                    problem = f"'{key.value}' is given twice"
+                    raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                found.add(key.value)
+            return dict(super().construct_mapping(node, deep))
+
+    return Loader
+
+
 def ordered_pair(first: str, second: str) -> tuple[str, str]:
     """The two names in alphabetical order."""
     return (first, second) if first < second else (second, first)
 
 
 def _number(value: float) -> str:
-    text = repr(value)
+    text = repr(float(value))
     # YAML 1.1 takes 1e-05 for text and 1.0e-05 for a number
     return text if "e" not in text or "." in text else text.replace("e", ".0e")
 
