@@ -130,6 +130,12 @@ def test_paths_of_another_width_are_refused(planar_roadmap):
         run_teleoperation(planar_roadmap, paths={"line_self": torch.zeros(1, 5, 3)}, methods=["expansion"])
 
 
+@pytest.mark.parametrize("paths", [torch.zeros(0, 5, 2), torch.full((1, 5, 2), torch.nan)])
+def test_no_path_and_nan_are_refused_before_the_work(planar_roadmap, paths):
+    with pytest.raises(ParameterError, match="paths 'line_random': got (no path|NaN)"):
+        run_teleoperation(planar_roadmap, paths={"line_random": paths}, methods=["random"])
+
+
 def test_the_command_prints_a_table_and_json_and_writes_trajectories(planar_roadmap, tmp_path):
     file, out = tmp_path / "map.grr", tmp_path / "out.npz"
     planar_roadmap.save(file)

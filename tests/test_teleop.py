@@ -14,6 +14,7 @@ from grr_torch.applications.replay import read_waypoints, replay
 from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.applications.teleoperation_log import TeleoperationLog
 from grr_torch.errors import FileFormatError, ParameterError, UnknownNameError
+from grr_torch.interactive import drive as driving
 from grr_torch.interactive.drive import drive
 from grr_torch.interactive.session import Session
 from grr_torch.recording.teleoperation import record_teleoperation
@@ -125,6 +126,30 @@ def test_the_loop_ends_when_it_is_told_to(planar_roadmap):
     assert bool((times.diff() > 0.0).all())
     # never faster than the rate
     assert float(times[-1]) >= 11 / 200.0 - 1e-3
+
+
+def test_a_step_that_comes_late_is_not_made_up_for(planar_roadmap, monkeypatch):
+    session, late = Session(Teleoperator(planar_roadmap, rate=50.0)), iter([0.0, 0.03, 0.0, 0.015, 0.0, 0.0])
+
+    class Clock:
+        now = 0.0
+
+        def perf_counter(self):
+            self.now += 1e-4
+            return self.now
+
+        def is_set(self):
+            return len(shown) == 6
+
+        def wait(self, seconds):
+            self.now += seconds + next(late)
+
+    clock, shown = Clock(), []
+    monkeypatch.setattr(driving, "time", clock)
+    drive(session, shown.append, clock)
+    apart = session.log.times.diff()
+    assert float(apart.min()) >= 0.02
+    assert float(apart.max()) >= 0.05
 
 
 def test_an_arm_with_slow_joints_gets_a_slower_path(kinova_roadmap):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -195,6 +197,17 @@ def test_any_number_of_arms_in_single_precision_track(count):
     assert q.dtype == torch.float32
     assert (status == "tracking").mean() > 0.8
     assert (roadmap.robot.forward_kinematics(q)[0] - targets).norm(dim=2).max() < 0.02
+
+
+def test_no_step_is_longer_than_the_limits_in_single_precision_either(kinova_roadmap):
+    roadmap = replace(kinova_roadmap, robot=grr_torch.load_robot("kinova", dtype=torch.float32))
+    vertices = roadmap.resolved.nonzero()[:6, 0]
+    start = roadmap.configurations[vertices].float()
+    teleoperator = Teleoperator(roadmap, start=start)
+    targets = roadmap.points[roadmap.resolved][-6:].float().expand(80, -1, -1)
+    q, _ = follow_targets(teleoperator, targets)
+    moved = torch.cat([start[None], q]).double().diff(dim=0).abs() * 50.0 / roadmap.robot.velocity_limits
+    assert 0.9 < float(moved.max()) <= 1.0
 
 
 @pytest.mark.parametrize("again", [False, True], ids=["built", "loaded"])

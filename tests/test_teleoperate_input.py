@@ -101,6 +101,7 @@ def test_after_the_clutch_it_starts_where_the_arm_is(roadmap):
     [
         ({"rate": 0.0}, "rate"),
         ({"rate": float("nan")}, "rate"),
+        ({"rate": 1e9}, "rate: got 1000000000.0; valid: above 0 and up to"),
         ({"max_step": -0.1}, "max_step"),
         ({"max_step": torch.ones(3)}, "max_step"),
         ({"acceleration_limits": 0.0}, "acceleration_limits"),

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from grr_torch.applications.retime import usual_speeds
+from grr_torch.applications.teleoperate import FASTEST
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.resolution.slices import fullest_slice
@@ -17,8 +18,8 @@ from grr_torch.spaces.configuration import difference
 
 KINDS = ("circle", "line")
 
-# metres a second along a path, and the most waypoints a second
-_SPEED, _FASTEST = 0.15, 1e4
+# metres a second along a path
+_SPEED = 0.15
 # points at which a candidate is tried, sizes that are tried, and middles
 _POINTS, _SIZES, _MIDDLES = 96, 16, 5
 # of the largest size that fits, so that the path is not on the edge of reach; and of the joints' velocity limits
@@ -72,8 +73,8 @@ def example_path(roadmap: Roadmap, kind: str, rate: float = 50.0) -> Tensor:
     """
     if kind not in KINDS:
         raise UnknownNameError("path", kind, KINDS)
-    if not 0.0 < rate <= _FASTEST:
-        raise ParameterError("rate", rate, f"above 0 and up to {_FASTEST:,.0f} Hz")
+    if not 0.0 < rate <= FASTEST:
+        raise ParameterError("rate", rate, f"above 0 and up to {FASTEST:,.0f} Hz")
     centres = middles(roadmap, _MIDDLES)
     axis = centres[:1].clone()
     axis[:, :2] = 0.0

@@ -27,6 +27,8 @@ _MANY = 8
 _SAME_GOAL = 0.03
 # of the longest step, so that what the projection adds seldom has to be cut off
 SLACK = 0.98
+# of the precision of numbers, what a step is cut by so that rounding does not lengthen it
+_ROUNDING = 16.0
 # what the length of a motion counts beside the steps that its slowest joint takes
 _TIE = 0.01
 
@@ -78,7 +80,8 @@ class Motions:
     def limited(self, q: Array, towards: Array) -> tuple[Array, Mask]:
         """Configurations (B, n) towards others by at most a step, not wrapped, and which of them are there (B,)."""
         motion = self.difference(q, towards)
-        share = ((1.0 - 1e-12) * self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
+        least = max(1e-12, _ROUNDING * float(np.finfo(q.dtype).eps))
+        share = ((1.0 - least) * self._longest / np.maximum(np.abs(motion), 1e-12)).min(1)
         return q + np.minimum(share, 1.0)[:, None] * motion, share >= 1.0
 
     def difference(self, start: Array, end: Array) -> Array:

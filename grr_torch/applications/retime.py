@@ -12,6 +12,8 @@ from grr_torch.errors import GrrError, ParameterError
 
 # what is taken for a joint that has no velocity limit [rad/s or m/s]
 _SPEED = 1.0
+# the smallest limits
+_SLOWEST = 1e-9
 # of every time, so that rounding does not break a limit
 _SLACK = 1e-9
 # times stay finite where a path stops [share of the highest ṡ²]
@@ -37,7 +39,8 @@ def retime(q: Tensor, velocity_limits: Tensor, acceleration_limits: Tensor | Non
     durations = (steps.abs() / velocity_limits).amax(1)
     if acceleration_limits is not None:
         durations = _with_accelerations(steps, durations, acceleration_limits)
-    return torch.cat([q.new_zeros(1), (durations * (1.0 + _SLACK)).cumsum(0)])
+    slack = max(_SLACK, 16.0 * torch.finfo(q.dtype).eps)
+    return torch.cat([q.new_zeros(1), (durations * (1.0 + slack)).cumsum(0)])
 
 
 def accelerations(q: Tensor, times: Tensor) -> Tensor:
@@ -71,6 +74,10 @@ def _highest_speed(tangents: Tensor, lengths: Tensor, bounds: Tensor, limits: Te
     count = len(lengths)
     bend = torch.zeros(count + 1, tangents.shape[1], dtype=tangents.dtype)
     bend[1:-1] = tangents.diff(dim=0) / (0.5 * (lengths[1:] + lengths[:-1]))[:, None]
+    # with the largest acceleration of any piece as far as the middle of the path: where that is far below the other
+    # bounds, all would come down to the solver's tolerance
+    reach = float(lengths.sum() * (limits / tangents.abs().clamp_min(1e-12)).amin(1).max())
+    bounds = bounds.clamp_max(reach)
     scale = float(bounds.max())
     rows = []
     for joint, limit in enumerate((limits / scale).tolist()):
@@ -95,11 +102,11 @@ def per_joint(name: str, value: float | Tensor, like: Tensor) -> Tensor:
     """One positive number for each joint (n,).
 
     Raises:
-        ParameterError: It is not positive, or not one number or n of them.
+        ParameterError: It is too small, or not one number or n of them.
     """
     given = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-    if given.shape not in (torch.Size(), like.shape) or not bool(((given > 0.0) & given.isfinite()).all()):
-        raise ParameterError(name, value, f"one finite number above 0, or {len(like)} of them")
+    if given.shape not in (torch.Size(), like.shape) or not bool(((given >= _SLOWEST) & given.isfinite()).all()):
+        raise ParameterError(name, value, f"one finite number, {_SLOWEST:g} or more, or {len(like)} of them")
     return given.expand(len(like)).clone()
 
 

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 _ITERATIONS = 6
 # of how much faster than the control steps, as a share, the clock of inputs may seem to go: neither goes exactly
 _DRIFT = 0.03
+# control steps a second [Hz]
+FASTEST = 1e4
 # seconds that can be looked ahead
 _FARTHEST_AHEAD = 60.0
 
@@ -101,8 +103,8 @@ class Teleoperator:
         robot = roadmap.robot
         if robot.device.type != "cpu":
             raise ParameterError("device of the robot", str(robot.device), "cpu, where few arms are fastest")
-        if not 0.0 < rate < math.inf:
-            raise ParameterError("rate", rate, "above 0, in Hz")
+        if not 0.0 < rate <= FASTEST:
+            raise ParameterError("rate", rate, f"above 0 and up to {FASTEST:,.0f} Hz")
         for name, value in (("max_jump", max_jump), ("timeout", timeout)):
             if not value > 0.0:
                 raise ParameterError(name, value, "above 0")

@@ -117,6 +117,9 @@ def run_teleoperation(
             raise UnknownNameError("kind of path", kind, KINDS)
         if waypoints.ndim != 3 or waypoints.shape[2] != roadmap.task.width or waypoints.shape[1] < 2:
             raise ParameterError(f"paths '{kind}'", tuple(waypoints.shape), f"(paths, 2 or more, {roadmap.task.width})")
+        if len(waypoints) == 0 or not bool(waypoints.isfinite().all()):
+            given = "no path" if len(waypoints) == 0 else "NaN or infinite values"
+            raise ParameterError(f"paths '{kind}'", given, "one or more, with finite values")
     runs: list[Run] = []
     for method in methods:
         own = _random_roadmap(roadmap, seed, progress) if method == "random" else roadmap

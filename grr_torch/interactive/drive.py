@@ -20,8 +20,9 @@ def drive(session: Session, show: Callable[[Step], None], stop: Event) -> None:
         show: Told of every step; it must not wait.
         stop: Ends the loop.
     """
-    start = due = time.perf_counter()
+    period = 1.0 / session.rate
+    start = time.perf_counter()
     while not stop.is_set():
-        show(session.tick(time.perf_counter() - start))
-        due = max(due + 1.0 / session.rate, time.perf_counter())
-        stop.wait(due - time.perf_counter())
+        begun = time.perf_counter()
+        show(session.tick(begun - start))
+        stop.wait(max(begun + period - time.perf_counter(), 0.0))
