@@ -66,7 +66,12 @@ def train_ik(
     roadmap = Roadmap.load(file, device=device)
     try:
         with progress_bar() as progress:
-            ik = train(roadmap, options, out=out, resume=resume, on_epoch=_show_epoch, progress=progress)
+
+            def show(epoch: Epoch) -> None:
+                progress.line = ""  # epochs have lines of their own
+                _show_epoch(epoch)
+
+            ik = train(roadmap, options, out=out, resume=resume, on_epoch=show, progress=progress)
     except KeyboardInterrupt:
         if not checkpoint_path(out).exists():
             raise
