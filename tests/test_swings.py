@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -151,6 +152,33 @@ def test_a_swing_that_has_arrived_is_over(kinova_roadmap):
         steps, _, free = detours.swing(state, which, goal)
         moved = np.abs(steps - state.q).max()
         assert not free[0] or moved > 1e-3
+
+
+def test_a_swing_that_leads_no_nearer_is_over_until_the_goal_is_another(kinova_roadmap, monkeypatch):
+    """Where the tool has to be turned on the way, the arm may be led off for ever."""
+    vertex, other, third = some_vertices(kinova_roadmap, 3)
+    arms = Teleoperator(kinova_roadmap, start=kinova_roadmap.configurations[vertex][None])
+    detours, state, which = arms._pilot.detours, arms._arms, np.arange(1)
+    goal, goal_q = (part[other][None].numpy() for part in (kinova_roadmap.points, kinova_roadmap.configurations))
+    swing = Follower.swing
+
+    def astray(follower, q, p, ends, bounds, *, wholly):
+        lines = swing(follower, q, p, ends, bounds, wholly=wholly)
+        steps = q - 0.01 * np.sign(follower.difference(q, ends)) if not wholly else lines.steps
+        free = np.ones_like(lines.direct)
+        return replace(lines, steps=steps, safe=free, direct=free)
+
+    monkeypatch.setattr(Follower, "swing", astray)
+
+    def free() -> bool:
+        return bool(detours.swing(state, which, goal_q)[2][0])
+
+    detours.set_goals(state, which, goal)
+    assert [free() for _ in range(4)] == [True, False, False, False]
+    detours.set_goals(state, which, goal)
+    assert not free()
+    detours.set_goals(state, which, kinova_roadmap.points[third][None].numpy())
+    assert free()
 
 
 @pytest.fixture(scope="module")

@@ -75,6 +75,7 @@ class Detour:
         left_vertex: (B,) the vertex that the route led to before, −1 where there was none, and
         next_vertex: (B,) the vertex that a route leads to next; −1 where there is no route.
         swing: (B, n) the configuration that a swing leads to; NaN where there is none.
+        refused: (B,) arms whose swing to that goal came to nothing: they take a route.
         blind: (B,) steps for which an arm on a detour follows it before it looks for a straight way to its target.
         aimed: (B, width) the target for which it does so; a target elsewhere is looked for at once.
         doubt: (B,) how many these are the next time.
@@ -87,6 +88,7 @@ class Detour:
     left_vertex: Array
     next_vertex: Array
     swing: Array
+    refused: Mask
     blind: Array
     aimed: Array
     doubt: Array
@@ -102,6 +104,7 @@ class Detour:
             left_vertex=_counts(q, -1),
             next_vertex=_counts(q, -1),
             swing=np.full_like(q, np.nan),
+            refused=_nobody(q),
             blind=_counts(q, 0),
             aimed=_unknown(q, width),
             doubt=_counts(q, 1),
@@ -124,7 +127,7 @@ class Detour:
     def forget(self, which: Array) -> None:
         """Arms (A,) that have no more need of one."""
         self.end(which)
-        self.blind[which], self.hesitated[which] = 0, 0
+        self.blind[which], self.hesitated[which], self.refused[which] = 0, 0, False
         for arm in which.tolist():
             self.avoided[arm] = frozenset()
 

@@ -45,11 +45,13 @@ class Detours:
         for arm in which[moved].tolist():
             detour.avoided[arm] = frozenset()
         detour.last_goal[which[moved]], detour.last_vertex[which[moved]] = goals[moved], -1
+        detour.refused[which[moved]] = False
 
     def swing(self, arms: Arms, which: Array, goals_q: Array) -> tuple[Array, Array, Mask]:
         """Swings of arms to configurations (A, n), or next to them. No route is quicker.
 
-        One that an arm is already on has been looked at; of it only the step is. One that is not free is over.
+        One that an arm is already on has been looked at; of it only the step is. One that is not free, or leads no
+        nearer, since the tool had to be turned on the way, is over.
 
         Returns:
             Steps (A, n), the points (A, width) where tools are after them, and which swings (A,) are free.
@@ -65,6 +67,10 @@ class Detours:
                 lines = self.follower.swing(*placed, ends[rows], self.solver.bounds, wholly=wholly)
                 steps[rows], points[rows] = lines.steps, lines.points
                 free[rows] = lines.direct if wholly else lines.safe
+        left = self.follower.distance(arms.q[which], ends)
+        astray = under_way & ~(self.follower.distance(steps, ends) < left)
+        detour.refused[which[astray]] = True
+        free &= ~detour.refused[which]
         # a route is left for a swing that is free, not for one that is refused
         detour.swing[which] = np.where(free[:, None], ends, np.nan)
         detour.next_vertex[which[free]] = -1
