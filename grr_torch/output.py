@@ -27,7 +27,9 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     Raises:
         OutputError: Its folder is missing or not writable, or it is there and no regular file.
     """
-    path, target = Path(path), Path(os.path.realpath(path))
+    path = Path(path)
+    # what is asked about is what a link leads to, by the name that was given where there is none
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
     try:
         if target.is_dir():
             raise OutputError(path, "it is a folder")
