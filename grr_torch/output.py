@@ -39,7 +39,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
             raise OutputError(path, f"folder '{target.parent}' does not exist")
         handle, name = _temporary(target)
         os.close(handle)
-        os.unlink(name)
+        Path(name).unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(path, str(error.strerror)) from error
 

@@ -236,6 +236,12 @@ def test_a_link_given_twice_is_refused(text):
         SphereModel.parse(text, ["a", "b", "c"], source="text")
 
 
+@pytest.mark.parametrize("text", ["? [a, b]\n: c\n", "collision_spheres: !!map [1, 2]\n", "{[a]: 1}", "!!set {a, b}"])
+def test_yaml_that_is_no_sphere_file_is_a_clear_error(text):
+    with pytest.raises(FileFormatError, match="is not YAML|is not a sphere file"):
+        SphereModel.parse(text, ["a", "b"], source="text")
+
+
 def test_names_that_yaml_takes_for_something_else_survive():
     names = ["on", "No", "y", "null", "True", "~", "1e5", "0x1F", "1_0", "é", "a: b", "a#b", 'a"b', "a\\b", "a\tb", "-"]
     spheres = {name: (Sphere((0.0, 0.0, 1.0), 0.5),) for name in names}

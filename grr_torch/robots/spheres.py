@@ -135,8 +135,9 @@ def _loader() -> Any:
 
     class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # yaml comes without types
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+            pairs = node.value if isinstance(node, yaml.MappingNode) else ()
             found = set()
-            for key, _ in node.value:
+            for key in (key for key, _ in pairs if isinstance(key, yaml.ScalarNode)):
                 if key.value in found:
                     problem = f"'{key.value}' is given twice"
                     raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
