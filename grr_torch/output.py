@@ -14,7 +14,7 @@ from grr_torch.errors import OutputError, ParameterError
 
 try:
     import fcntl
-except ImportError:  # Windows
+except ImportError:  # where there are no POSIX locks, two users of one folder are not noticed
     fcntl = None  # type: ignore[assignment]
 
 # files that were not finished

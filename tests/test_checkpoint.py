@@ -17,6 +17,7 @@ from safetensors.torch import load_file, save_file
 from typer.testing import CliRunner
 
 import grr_torch
+from grr_torch import output
 from grr_torch.errors import FileFormatError, GrrWarning, OutputError, ParameterError
 from grr_torch.resolution import checkpoint as checkpoints
 from grr_torch.resolution.checkpoint import Checkpoint, Stage
@@ -253,7 +254,7 @@ def test_no_space_left_is_a_clear_error_and_what_is_there_is_gone_on_from(planar
     assert equal(again, undisturbed)
 
 
-@pytest.mark.skipif(checkpoints.fcntl is None, reason="no POSIX locks here")
+@pytest.mark.skipif(output.fcntl is None, reason="no POSIX locks here")
 def test_two_builds_do_not_share_a_folder(planar_5, tmp_path):
     refused = []
     options = {"points": 60, "checkpoint": tmp_path, "resume": True}

@@ -14,7 +14,6 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 import grr_torch
 from grr_torch.applications.plan import Planner
 from grr_torch.applications.retime import accelerations
-from grr_torch.applications.routes import Routes
 from grr_torch.errors import ParameterError
 from grr_torch.spaces.configuration import distance
 
@@ -32,7 +31,7 @@ def roadmap(request):
 def solved_points(roadmap, count, seed, spread=0.02):
     """Points near resolved vertices of the largest connected part, which the map solves."""
     generator = torch.Generator().manual_seed(seed)
-    part = Routes(roadmap).part[roadmap.solver.vertices]
+    part = roadmap.routes.part[roadmap.solver.vertices]
     vertices = roadmap.solver.vertices[torch.from_numpy(part == torch.from_numpy(part).mode().values.item())]
     chosen = vertices[torch.randint(len(vertices), (8 * count,), generator=generator)]
     noise = torch.randn(8 * count, roadmap.task.width, generator=generator, dtype=torch.float64)
@@ -91,7 +90,7 @@ def test_a_path_leads_along_connected_edges(roadmap):
 
 
 def test_between_vertices_no_route_is_shorter(roadmap):
-    routes = Routes(roadmap)
+    routes = roadmap.routes
     generator = torch.Generator().manual_seed(3)
     for _ in range(3):
         start, goal = solved_points(roadmap, 2, seed=int(torch.randint(1 << 30, (), generator=generator)), spread=0.0)
@@ -125,7 +124,7 @@ def test_where_the_averages_do_not_follow_the_edges_paths_do(roadmap):
     planner = Planner(thin)
     ends = [planner._vertices(vertices) for vertices in thin.edges[thin.connected].T]
     assert any(way is None for way in planner.ways.on_map(*ends))
-    part = Routes(thin).part
+    part = thin.routes.part
     generator = torch.Generator().manual_seed(17)
     vertices = thin.solver.vertices[torch.randint(len(thin.solver.vertices), (12,), generator=generator)]
     for a, b in vertices.reshape(-1, 2).tolist():

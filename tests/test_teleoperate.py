@@ -10,7 +10,6 @@ from teleoperated import follow_targets, some_vertices
 import grr_torch
 from grr_torch.applications.braking import limit_acceleration
 from grr_torch.applications.lines import Follower
-from grr_torch.applications.routes import Routes
 from grr_torch.applications.steps import STATUSES, Steps
 from grr_torch.applications.straight import Straight
 from grr_torch.applications.teleoperate import Teleoperator
@@ -229,7 +228,7 @@ def test_a_robot_in_single_precision_is_solved_for_and_teleoperated(tmp_path, ag
 
 
 def test_routes_leave_out_the_edges_that_are_avoided(roadmap):
-    routes = Routes(roadmap)
+    routes = roadmap.routes
     goal, start = some_vertices(roadmap, 2, 17).tolist()
     cost, following = routes.towards(goal)
     avoided: frozenset[tuple[int, int]] = frozenset()

@@ -23,11 +23,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from grr_torch.errors import FileFormatError, GrrError, UnknownNameError
 from grr_torch.fleet.options import known_options
 from grr_torch.fleet.order import Needs, Order, Planner
+from grr_torch.strict_yaml import parse_yaml
 
 _PARTS = ("defaults", "grid", "builds", "needs")
 _MOST = 100_000
@@ -64,27 +63,12 @@ def _read_yaml(path: Path) -> Any:
     if not path.is_file():
         raise FileFormatError(path, "is not a regular file" if path.exists() else "does not exist")
     try:
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)  # a safe loader
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(path, f"is not text: {error}") from error
     except OSError as error:
         raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise FileFormatError(path, f"is not YAML that can be used: {reason}") from error
-
-
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml comes without types
-    """YAML's safe loader, which refuses what it else lets pass: one key twice."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        found = set()
-        for key, _ in node.value:
-            name = self.construct_object(key, deep=True)
-            if not isinstance(name, str):
-                raise yaml.constructor.ConstructorError(None, None, f"{name!r} is no name", key.start_mark)
-            if name in found:
-                raise yaml.constructor.ConstructorError(None, None, f"'{name}' is given twice", key.start_mark)
-            found.add(name)
-        return dict(super().construct_mapping(node, deep))
+    return parse_yaml(text, path)
 
 
 def _check_parts(path: Path, data: Any) -> None:

@@ -20,11 +20,6 @@ from typing import Any
 
 from torch import Tensor
 
-try:
-    import fcntl
-except ImportError:  # where there are no POSIX locks, two builds in one folder are not noticed
-    fcntl = None  # type: ignore[assignment]
-
 from grr_torch.errors import FileFormatError, GrrWarning, OutputError
 from grr_torch.output import PARTIAL, atomic_write, lock_folder, remove_partial
 from grr_torch.tensor_file import read_tensors, tensor_hash, write_tensors

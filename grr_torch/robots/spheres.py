@@ -8,12 +8,12 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from grr_torch.errors import FileFormatError, ParameterError, UnknownNameError
 from grr_torch.output import atomic_write
+from grr_torch.strict_yaml import parse_yaml
 
 # what YAML 1.1 takes for a truth value, or none
 _NOT_TEXT = ("y", "yes", "n", "no", "true", "false", "on", "off", "null")
@@ -109,12 +109,7 @@ class SphereModel:
     @staticmethod
     def parse(text: str, links: Sequence[str], *, source: str) -> SphereModel:
         """Reads YAML text; see `load`."""
-        import yaml
-
-        try:
-            data = yaml.load(text, Loader=_loader())
-        except (yaml.YAMLError, ValueError, OverflowError) as error:
-            raise FileFormatError(source, f"is not YAML: {' '.join(str(error).split())}") from error
+        data = parse_yaml(text, source)
         for outer in ("robot_cfg", "kinematics"):  # cuRobo nests both entries in these
             if isinstance(data, dict) and outer in data:
                 data = data[outer]
@@ -126,25 +121,6 @@ class SphereModel:
             raise FileFormatError(source, "'self_collision_ignore' must map a link to a list of links")
         ignored = {(_link(a, links), _link(b, links)) for a, others in ignore.items() for b in others}
         return SphereModel(spheres, frozenset(ignored))
-
-
-@cache
-def _loader() -> Any:
-    """YAML's safe loader, which refuses what it else lets pass: one key twice, of which only the last would count."""
-    import yaml
-
-    class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # yaml comes without types
-        def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-            pairs = node.value if isinstance(node, yaml.MappingNode) else ()
-            found = set()
-            for key in (key for key, _ in pairs if isinstance(key, yaml.ScalarNode)):
-                if key.value in found:
-                    problem = f"'{key.value}' is given twice"
-                    raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
-                found.add(key.value)
-            return dict(super().construct_mapping(node, deep))
-
-    return Loader
 
 
 def ordered_pair(first: str, second: str) -> tuple[str, str]:
