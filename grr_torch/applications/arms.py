@@ -143,6 +143,7 @@ class Meeting:
         going: (B,) steps for which they have gone straight.
         place: (B, width) where an arm that has fallen behind meets its target, which it heads for as for a target; NaN
             where there is no such place.
+        across: (B,) whether that is on the other side of a hole.
         looks_in: (B,) steps until it is looked for again.
         caught_up: (B,) steps for which the arm has been next to its target.
     """
@@ -152,6 +153,7 @@ class Meeting:
     velocity: Array
     going: Array
     place: Array
+    across: Mask
     looks_in: Array
     caught_up: Array
 
@@ -164,6 +166,7 @@ class Meeting:
             velocity=np.zeros((len(q), dimension), q.dtype),
             going=_counts(q, 0),
             place=_unknown(q, width),
+            across=_nobody(q),
             looks_in=_counts(q, 0),
             caught_up=_counts(q, 0),
         )

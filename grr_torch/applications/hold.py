@@ -66,7 +66,7 @@ def nearest_feasible(
     tried[:, [0, -1]] = True
     solved = np.zeros_like(tried)
     q = np.full((*tried.shape, base_q.shape[1]), np.nan, base.dtype)
-    q[tried], solved[tried], strayed = _solve(follower, solver, points[tried])
+    q[tried], solved[tried], strayed = solve_few(follower, solver, points[tried])
     # near full stretch, much joint motion brings little; no farther into it than where the arm is
     stretched = np.zeros(tried.shape, base.dtype)
     stretched[tried] = np.nan_to_num(strayed)
@@ -95,7 +95,7 @@ def much_nearer(follower: Follower, solver: Solver, points: Array, targets: Arra
     return distances < NEARER * task.gap_of_few(points, targets), vertices
 
 
-def _solve(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Mask, Array]:
+def solve_few(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Mask, Array]:
     """Configurations (N, n) of the map at points (N, width), which are valid, and how far their guesses were off.
 
     `Solver.solve_from` for arrays.

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from grr_torch.applications.arms import Arms, Meeting
+from grr_torch.applications.hold import solve_few
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.solve import LAST_VALID, Solver
 from grr_torch.pieces import Array, Mask, norms, some
@@ -27,15 +28,25 @@ _MEAN, _STALE = 0.1, 0.15
 _LEAP, _REST = 5.0, 0.05
 # a motion whose cosine with the mean is less has turned
 _STRAIGHT = 0.8
-# a place to meet is kept until a better one is farther from it than this [m]
-_MOVED = 0.05
+# an arm so near [m] to where it meets its target is there
+_THERE = 0.01
+# a place to meet is kept until a better one is farther from it than this share of the way there
+_MOVED = 0.5
+# and one on the other side of a hole as long as it is no farther than this [m] from where its target goes
+_ASIDE = 0.05
 # what has gone straight so long is taken to go on for so many times as long
 _AS_LONG = 1.5
-# of the way from where a target comes out of a hole to where it can be met in time: an arm heads for that, for to be
-# on the target's path again sooner is worth being a little late
-_LATE = 0.5
 # what is not so far [s] is come to along the edge of reach
 _FAR = 0.4
+# points from where a target seems to come out of a hole on that are solved, to see from where it can be followed: where
+# its joint motion from one to the next takes no longer than so many times what the target takes
+_SOLVED, _STEEP = 14, 2.0
+# an arm that has to make about half a turn [rad], for the target goes right through the middle of the hole, meets it so
+# much later [s]: the way round is shorter there
+_HALF_TURN, _LATER = 2.95, 0.28
+# an arm that is behind goes along its target's way by so many steps at a time: straight to the target, it would leave
+# out all that is between
+_CHORD = 12.0
 # steps in which an arm that is next to its target can be there
 _NEXT_TO = 2.0
 # an arm that is next to its target for so long [s] has caught up: at once, it would fall behind again beside the hole
@@ -46,9 +57,9 @@ class Pursuit:
     """Aims for arms whose targets they cannot follow.
 
     A target is taken to go on straight, as fast as it has been, for half as long again as it has done so. An arm whose
-    target has gone into a hole of the map waits as near as it can, and sets off for the other side when it has to in
-    order to be there in time. If it is too late for that, it heads for a point beyond the hole, somewhat before the
-    first one at which it can be in time. From then on it heads for the first such point, until it has caught up.
+    target has gone into a hole of the map waits as near as it can, and sets off for where the target can be followed
+    again when it has to in order to be there in time. From there on it goes along the target's way, as fast as it can,
+    until it has caught up.
     """
 
     def __init__(self, follower: Follower, solver: Solver, rate: float, foresight: float) -> None:
@@ -56,6 +67,8 @@ class Pursuit:
         self.follower, self.solver, self.rate = follower, solver, rate
         horizon = math.ceil(min(foresight * rate, _FARTHEST))
         self._ahead = np.unique(np.linspace(0, horizon, 1 + min(horizon, _LOOKED)).round())
+        self._turning = np.zeros(follower.robot.n, dtype=bool)
+        self._turning[[joint.dof for joint in follower.robot.tree.joints if joint.revolute]] = True
 
     def aims(self, arms: Arms, which: Array, targets: Array) -> Array:
         """The points (A, width) that some arms (A,) head for, whose targets are (A, width)."""
@@ -76,6 +89,8 @@ class Pursuit:
         rows = (due & (meeting.looks_in[which] <= 0)).nonzero()[0] if arms.turn else ()
         if len(rows):
             meeting.looks_in[which[rows]] = _EVERY
+            rows = rows[~self._goes_on(arms, which[rows], targets[rows])]
+        if len(rows):
             self._look(arms, which[rows], targets[rows], behind[rows])
         planned = meeting.planned(which)
         # who is next to its target keeps the same little way ahead of it
@@ -85,9 +100,9 @@ class Pursuit:
         return np.where(planned[:, None], meeting.place[which], targets)
 
     def _on_way(self, targets: Array, velocity: Array, steps: Array) -> Array:
-        """Points (A, K, width) where targets (A, width) are after steps (K,) with a velocity (A, d)."""
-        points = targets[:, None].repeat(len(steps), 1)
-        points[..., : velocity.shape[1]] += steps.astype(targets.dtype)[:, None] * velocity[:, None]
+        """Points (A, K, width) where targets (A, width) are after steps (K,), or (A, K), with a velocity (A, d)."""
+        points = targets[:, None].repeat(steps.shape[-1], 1)
+        points[..., : velocity.shape[1]] += steps.astype(targets.dtype)[..., None] * velocity[:, None]
         return points
 
     def _watch(self, meeting: Meeting, which: Array, targets: Array) -> None:
@@ -105,36 +120,90 @@ class Pursuit:
             mean = np.where(goes_on[:, None], mean, np.where((rests & ~stale)[:, None], velocity, 0.0))
         meeting.velocity[which] = mean
         meeting.going[which] = np.where(rests | goes_on & straight, meeting.going[which] + 1, 0)
+        meeting.across[which] &= meeting.going[which] > 0
         meeting.given[which] = targets
         meeting.unchanged[which[~rests]] = 0
 
+    def _goes_on(self, arms: Arms, which: Array, targets: Array) -> Mask:
+        """Which arms (A,) go on to the other side of a hole, or wait there for targets (A, width)."""
+        meeting = arms.meeting
+        place, velocity = meeting.place[which], meeting.velocity[which]
+        ahead = self._steps_ahead(place, targets, velocity)
+        aside = norms((place - self._on_way(targets, velocity, ahead[:, None])[:, 0])[:, : velocity.shape[1]])
+        there = self.follower.task.gap_of_few(arms.p[which], place) <= _THERE
+        # comparison with NaN, where there is no place, is false
+        return meeting.across[which] & (aside < _ASIDE) & ((ahead > 0.0) | ~there)
+
+    def _steps_ahead(self, points: Array, targets: Array, velocity: Array) -> Array:
+        """Of how many steps of targets (A, width) points (A, width) are ahead (A,), along velocities (A, d)."""
+        gap = (points - targets)[:, : velocity.shape[1]]
+        return (gap * velocity).sum(1) / np.maximum((velocity * velocity).sum(1), np.finfo(velocity.dtype).tiny)
+
     def _look(self, arms: Arms, which: Array, targets: Array, behind: Mask) -> None:
         """Looks for where arms (A,) meet targets (A, width); those that are not `behind` (A,) may wait."""
-        meeting = arms.meeting
-        steps, points = self._ahead, self._on_way(targets, meeting.velocity[which], self._ahead)
+        meeting, steps, rows = arms.meeting, self._ahead, np.arange(len(which))
+        velocity = meeting.velocity[which]
+        points = self._on_way(targets, velocity, steps)
         open_, needs = self._needs(arms.q[which], points)
-        known, rows = steps <= _AS_LONG * meeting.going[which, None], np.arange(len(which))
-        in_time = (needs <= steps) & known
+        known = steps <= _AS_LONG * meeting.going[which, None]
+        in_time, near = (needs <= steps) & known, behind & (needs[:, 0] <= _NEXT_TO)
+        first = in_time.argmax(1)
+        goals, needed = steps[first], needs[rows, first]
         # on the other side of a hole that is ahead of the target, or that it is in
         shut = ~open_
         shut[:, 0] |= ~behind
         beyond = open_ & known & np.logical_or.accumulate(shut, axis=1) & (needs >= _FAR * self.rate)
-        first, out, can_meet = in_time.argmax(1), beyond.argmax(1), in_time & beyond
-        met = np.where(can_meet.any(1), can_meet.argmax(1), len(steps) - 1)
-        near = behind & (needs[:, 0] <= _NEXT_TO)
-        across = beyond.any(1) & (needs[rows, out] >= steps[out]) & ~near
-        near_out = out + np.round(_LATE * (met - out)).astype(np.int64)
-        first = np.where(across, np.where(open_[rows, near_out], near_out, out), first)
+        out = beyond.argmax(1)
+        across = beyond.any(1) & ~near & (behind | (needs[rows, out] + _EVERY >= steps[out]))
+        far = across.nonzero()[0]
+        if len(far):
+            times, found, there = self._beyond(arms.q[which[far]], points[far], out[far])
+            across[far] = found & (behind[far] | (there >= times))
+            far, times = far[across[far]], times[across[far]]
+            goals[far] = times
         meeting.caught_up[which] = np.where(near, meeting.caught_up[which] + _EVERY, 0)
-        meets = in_time.any(1) & behind | can_meet.any(1) & across
-        meets &= (first > 0) & (meeting.caught_up[which] < _CAUGHT_UP * self.rate)
+        meets = (across | in_time.any(1) & behind) & (goals > 0.0)
+        meets &= meeting.caught_up[which] < _CAUGHT_UP * self.rate
         # who is at its target does not leave it for a hole ahead; guesses beside one are rough
         there = behind & self.follower.same_goal(arms.p[which], targets)
-        meets &= ~(there & (needs[rows, first] >= _FAR * self.rate))
-        place = points[rows, first]
-        kept = self.follower.task.gap_of_few(place, meeting.place[which]) < _MOVED
+        meets &= ~(there & (across | (needed >= _FAR * self.rate)))
+        meeting.across[which] = across & meets
+        # along the way, from where the arm is
+        mine = self._steps_ahead(arms.p[which], targets, velocity)
+        some_way = mine + _CHORD * (goals - mine) / np.maximum(needed, 1.0)
+        follows = ~across & ~near & (mine < 0.0) & (some_way < goals)
+        place = self._on_way(targets, velocity, np.where(follows, some_way, goals)[:, None])[:, 0]
+        gap, last = self.follower.task.gap_of_few, meeting.place[which]
+        kept = ~across & ~follows & (gap(place, last) < _MOVED * gap(arms.p[which], last))
         meeting.place[which[meets & ~kept]] = place[meets & ~kept]
         meeting.place[which[~meets]] = np.nan
+
+    def _beyond(self, q: Array, points: Array, out: Array) -> tuple[Array, Mask, Array]:
+        """Where arms at configurations (R, n) are to meet targets that come out of holes.
+
+        Args:
+            q: (R, n).
+            points: (R, K, width) where the targets will be.
+            out: (R,) the first of these that are likely on the other side.
+
+        Returns:
+            After how many steps (R,), whether there is such a place (R,), and the steps there (R,).
+        """
+        rows, steps = np.arange(len(q)), self._ahead
+        index = np.clip(out[:, None] + np.arange(-1, _SOLVED - 1), 0, len(steps) - 1)
+        looked, times = points[rows[:, None], index], steps[index]
+        solved, solvable, _ = solve_few(self.follower, self.solver, looked.reshape(-1, points.shape[2]))
+        ways, valid = solved.reshape(*index.shape, -1), solvable.reshape(index.shape)
+        passed = np.diff(times, axis=1)
+        pace = self.follower.duration(np.nan_to_num(self.follower.difference(ways[:, :-1], ways[:, 1:])))
+        followed = valid[:, :-1] & valid[:, 1:] & (passed > 0.0) & (pace <= _STEEP * passed)
+        exits, motion = followed.argmax(1), np.nan_to_num(self.follower.difference(q[:, None], ways))
+        half = np.abs(motion[rows, exits][:, self._turning]).max(1, initial=0.0) >= _HALF_TURN
+        after = times[rows, exits] + np.where(half, _LATER * self.rate, 0.0)
+        late = valid & (times >= after[:, None])
+        chosen = np.where(late.any(1), late.argmax(1), exits)
+        needs = self.follower.duration(motion[rows, chosen])
+        return np.minimum(after, times[rows, chosen]), np.asarray(followed.any(1)), needs
 
     def _needs(self, q: Array, points: Array) -> tuple[Mask, Array]:
         """Which points (A, K, width) are likely open (A, K), and the steps there (A, K) from configurations (A, n)."""
