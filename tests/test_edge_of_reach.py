@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from teleoperated import follow_targets, some_vertices
@@ -251,3 +252,18 @@ def test_targets_beyond_all_numbers_are_only_far_away(roadmap):
         command = teleoperator.step(torch.full((1, 3), 1e300, dtype=torch.float64))
     assert bool(command.configuration.isfinite().all())
     assert command.status[0] in ("unreachable", "detouring", "holding")
+
+
+def test_who_has_no_way_to_where_it_was_to_hold_holds_elsewhere(roadmap):
+    """An arm at the end of a route, from which no line leads on, does not try the same way for ever."""
+    vertex = some_vertices(roadmap, 1, 3)
+    point, q = roadmap.points[vertex].numpy(), roadmap.configurations[vertex].numpy()
+    teleoperator = Teleoperator(roadmap, start=roadmap.configurations[vertex])
+    arms, detours = teleoperator._arms, teleoperator._pilot.detours
+    arms.hold.point[:], arms.hold.q[:], arms.detour.last_goal[:] = point + 0.1, q + 0.5, point + 0.1
+    arms.detour.last_vertex[:] = arms.detour.next_vertex[:] = int(vertex)
+    target = point + 0.3
+    assert detours.give_up_ended(arms, np.array([0]), q, target).all()
+    assert not arms.hold.known(np.array([0])).any()
+    # and not even a jump leads there again
+    assert (arms.hold.barred == target).all()

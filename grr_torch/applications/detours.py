@@ -130,7 +130,8 @@ class Detours:
                 detour.avoided[arm] |= {edge}
                 detour.next_vertex[arm] = heading[row] if there[row] else -1
             else:
-                arms.hold.barred[arm] = targets[row]
+                # nor is there a way to where it was to hold
+                arms.hold.point[arm], arms.hold.q[arm], arms.hold.barred[arm] = np.nan, np.nan, targets[row]
             detour.blind[arm] = 0
         return ended
 
