@@ -136,11 +136,30 @@ def test_who_is_behind_catches_up_along_the_way(roadmap, through_holes):
 @pytest.mark.parametrize("back_at", [110, 140])
 def test_arms_turn_round_with_their_targets(roadmap, through_holes, back_at):
     """Targets that turn in the hole and go back, while arms are on their way to the other side."""
-    targets = torch.cat([through_holes[:back_at], through_holes[:back_at].flip(0), through_holes[:1].repeat(250, 1, 1)])
+    targets = torch.cat([through_holes[:back_at], through_holes[:back_at].flip(0), through_holes[:1].repeat(150, 1, 1)])
     tools, _, across = _led(roadmap, targets)
     assert across[back_at - 1].any()
+    assert not across[back_at + 10 : back_at + 20, across[back_at - 1]].any()
     assert np.linalg.norm(tools[-1] - targets[-1].numpy(), axis=1).max() < 0.01
-    assert not across[-1].any()
+
+
+def test_targets_that_cross_later_than_they_turn_are_met_too(roadmap, through_holes):
+    """A corner shortly before a hole: what is known to go straight for a moment only is followed all the same."""
+    along = through_holes[1] - through_holes[0]
+    away = torch.stack([-along[:, 1], along[:, 0], 0.0 * along[:, 0]], dim=1)
+    before = through_holes[90] + away * torch.arange(60, 0, -1)[:, None, None]
+    targets = torch.cat([before, through_holes[90:]])
+    ahead, without = (_followed(roadmap, targets, foresight)[0] for foresight in (2.0, 0.0))
+    assert _behind(ahead, targets) < 1.35 * _behind(without, targets)
+    assert _behind(ahead[-1:], targets[-1:]) < _behind(without[-1:], targets[-1:]) + 0.02
+
+
+@pytest.mark.parametrize("foresight", [0.3, 0.8, 2.0, 20.0])
+def test_foresight_brings_no_arm_farther_behind(roadmap, through_holes, foresight):
+    ahead, without = (_followed(roadmap, through_holes, seconds)[0] for seconds in (foresight, 0.0))
+    assert _behind(ahead, through_holes) < 1.02 * _behind(without, through_holes)
+    if foresight >= 2.0:
+        assert _behind(ahead, through_holes) < 0.8 * _behind(without, through_holes)
 
 
 def test_targets_that_cross_the_middle_of_a_hole_are_met_later(roadmap, through_holes, monkeypatch):
@@ -160,7 +179,7 @@ def test_targets_that_cross_the_middle_of_a_hole_are_met_later(roadmap, through_
     found = []
     for later in (0.0, pursuit._LATER):
         monkeypatch.setattr(pursuit, "_LATER", later)
-        times, there, _ = instance._beyond(q, points, out)
+        times, there, _ = instance._beyond(q, points, np.ones_like(open_), out)
         found.append(times[there])
         rows = there.nonzero()[0]
         met = torch.from_numpy(np.rint(60 + times[there])).long()
@@ -173,7 +192,18 @@ def test_targets_that_cross_the_middle_of_a_hole_are_met_later(roadmap, through_
     assert half.sum() >= 10
     assert np.median(added[half]) == pytest.approx(50.0 * pursuit._LATER)
     assert (added >= 0.0).all()
-    assert (added[(turns < pursuit._HALF_TURN - 0.1).numpy()] == 0.0).all()
+
+
+def test_targets_beside_the_middle_are_met_as_soon_as_they_can_be(roadmap, monkeypatch):
+    paths = draw_paths(roadmap, "line_random", 100, seed=3).transpose(0, 1)
+    met = []
+    for later in (0.0, pursuit._LATER):
+        monkeypatch.setattr(pursuit, "_LATER", later)
+        met.append(_led(roadmap, paths))
+    crossing = met[0][2].any(0)
+    assert crossing.sum() >= 10
+    same = (met[0][0] == met[1][0]).all(axis=(0, 2))
+    assert same[crossing].mean() > 0.7
 
 
 def _watched(roadmap, targets, rate, seen):

@@ -117,6 +117,26 @@ def test_arms_meet_targets_that_cross_the_base_with_a_turned_tool(yaw):
     assert behind[0][-1].mean() < 0.5 * behind[1][-1].mean()
 
 
+def test_arms_meet_targets_that_turn_while_they_cross_the_base(yaw):
+    """Where they meet, they are turned as the targets are, and not as these were when they set off."""
+    vertices = some_vertices(yaw, 60, 4)
+    start = yaw.points[vertices]
+    end = start * start.new_tensor([-1.0, -1.0, -1.0, 1.0])
+    inside = yaw.solve(end).valid
+    share = torch.linspace(0.0, 1.0, 200, dtype=torch.float64)[:, None, None]
+    targets = start[inside] + share * (end - start)[inside]
+    targets[..., 3] += 1.2 * ((share[..., 0] - 0.4) / 0.4).clamp(0.0, 1.0)
+    teleoperator = Teleoperator(yaw, start=yaw.configurations[vertices][inside], max_step=0.04)
+    across = 0
+    for target in targets:
+        teleoperator.step(target)
+        meeting = teleoperator._arms.meeting
+        rows = meeting.across & meeting.planned(np.arange(target.shape[0]))
+        across += int(rows.sum())
+        assert np.abs(np.sin(0.5 * (meeting.place[rows, 3] - target.numpy()[rows, 3]))).max(initial=0.0) < 1e-9
+    assert across > 100
+
+
 @pytest.mark.parametrize("name", ["planar_pose", "yaw"])
 def test_a_tool_turned_once_round_is_back_where_it_was(request, name):
     """On the spot, where all rotations are resolved; its joints end where they began."""

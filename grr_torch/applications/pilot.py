@@ -165,9 +165,9 @@ class Pilot:
             on_swing = self._swing(round_, rows[away], found[away])
             routed[rows[away][on_swing]] = False
             # no way to a target is quicker, so it is not left for one that is straight, until that is elsewhere
-            swings = chosen[on_swing & valid[away]]
-            left = self.follower.difference(arms.q[swings], arms.detour.swing[swings])
-            arms.detour.blind[swings] = np.ceil(self.follower.duration(left))
+            swings = on_swing & valid[away]
+            left = self.follower.difference(round_.steps.q[rows[away][swings]], arms.detour.swing[chosen[swings]])
+            arms.detour.blind[chosen[swings]] = np.ceil(self.follower.duration(left))
             others = ~on_swing
             self.detours.set_last_vertices(arms, chosen[others], goals[others], found[away][others])
         return routed

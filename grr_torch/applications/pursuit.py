@@ -18,10 +18,10 @@ _FARTHEST = 1_000_000
 # of the longest edge: what is so near a resolved vertex counts as open. Projections would tell, but take three times as
 # long as a look does without them
 _OPEN = 0.5
-# points at which a target's way ahead is looked at
-_LOOKED = 25
-# an arm looks in every so many-th step
-_EVERY = 8
+# points at which a target's way is looked at for so many seconds ahead; farther on, each is so many times as far
+_LOOKED, _NEAR, _FARTHER = 25, 2.0, 1.15
+# an arm looks after so many seconds again, but not in the next step
+_EVERY = 0.16
 # a target's motion is its mean over the last so many seconds, and none if it has not moved for longer than that
 _MEAN, _STALE = 0.1, 0.15
 # one that is faster than this [m/s] has leapt, and one that is slower rests
@@ -32,8 +32,9 @@ _STRAIGHT = 0.8
 _THERE = 0.01
 # a place to meet is kept until a better one is farther from it than this share of the way there
 _MOVED = 0.5
-# and one on the other side of a hole as long as it is no farther than this [m] from where its target goes
-_ASIDE = 0.05
+# and one on the other side of a hole as long as it is no farther than this [m] from where its target goes, and that has
+# not come past it for so long [s]
+_ASIDE, _TOO_LATE = 0.05, 0.6
 # what has gone straight so long is taken to go on for so many times as long
 _AS_LONG = 1.5
 # what is not so far [s] is come to along the edge of reach
@@ -41,12 +42,12 @@ _FAR = 0.4
 # points from where a target seems to come out of a hole on that are solved, to see from where it can be followed: where
 # its joint motion from one to the next takes no longer than so many times what the target takes
 _SOLVED, _STEEP = 14, 2.0
-# an arm that has to make about half a turn [rad], for the target goes right through the middle of the hole, meets it so
-# much later [s]: the way round is shorter there
+# an arm one of whose joints has to make about half a turn [rad], as for a target that goes through the base axis, meets
+# it so much later [s]: the way round is shorter there
 _HALF_TURN, _LATER = 2.95, 0.28
-# an arm that is behind goes along its target's way by so many steps at a time: straight to the target, it would leave
-# out all that is between
-_CHORD = 12.0
+# an arm that is behind goes along its target's way, so far [s] at a time: straight to the target, it would leave out
+# all that is between
+_CHORD = 0.24
 # steps in which an arm that is next to its target can be there
 _NEXT_TO = 2.0
 # an arm that is next to its target for so long [s] has caught up: at once, it would fall behind again beside the hole
@@ -58,15 +59,20 @@ class Pursuit:
 
     A target is taken to go on straight, as fast as it has been, for half as long again as it has done so. An arm whose
     target has gone into a hole of the map waits as near as it can, and sets off for where the target can be followed
-    again when it has to in order to be there in time. From there on it goes along the target's way, as fast as it can,
-    until it has caught up.
+    again when it has to, to be there in time, or if it can be in time only farther on. From there it goes along the
+    target's way, as fast as it can, until it has caught up.
     """
 
     def __init__(self, follower: Follower, solver: Solver, rate: float, foresight: float) -> None:
         """For `rate` control steps a second, and targets that are taken to go on so for `foresight` seconds at most."""
         self.follower, self.solver, self.rate = follower, solver, rate
         horizon = math.ceil(min(foresight * rate, _FARTHEST))
-        self._ahead = np.unique(np.linspace(0, horizon, 1 + min(horizon, _LOOKED)).round())
+        near = min(horizon, math.ceil(_NEAR * rate))
+        looked = np.linspace(0, near, 1 + min(near, _LOOKED)).round()
+        more = math.ceil(math.log(max(horizon / max(near, 1), 1.0), _FARTHER))
+        farther = near * _FARTHER ** np.arange(1, 1 + more)
+        self._ahead = np.unique(np.concatenate([looked, farther.round().clip(max=horizon)]))
+        self._every = max(2, round(_EVERY * rate))
         self._turning = np.zeros(follower.robot.n, dtype=bool)
         self._turning[[joint.dof for joint in follower.robot.tree.joints if joint.revolute]] = True
 
@@ -84,13 +90,14 @@ class Pursuit:
         moves = norms(meeting.velocity[which]) > _REST / self.rate
         meeting.place[which[~moves]] = np.nan
         due &= moves
-        meeting.looks_in[which] = np.where(due, meeting.looks_in[which] - 1, 0)
+        goes_on = self._goes_on(arms, which, targets)
+        soon = due & ~(meeting.across[which] & ~goes_on)
+        meeting.looks_in[which] = np.where(soon, meeting.looks_in[which] - 1, 0)
+        meeting.across[which] = goes_on
         # not in the steps in which points to hold at are searched for
-        rows = (due & (meeting.looks_in[which] <= 0)).nonzero()[0] if arms.turn else ()
+        rows = (due & ~goes_on & (meeting.looks_in[which] <= 0)).nonzero()[0] if arms.turn else ()
         if len(rows):
-            meeting.looks_in[which[rows]] = _EVERY
-            rows = rows[~self._goes_on(arms, which[rows], targets[rows])]
-        if len(rows):
+            meeting.looks_in[which[rows]] = self._every
             self._look(arms, which[rows], targets[rows], behind[rows])
         planned = meeting.planned(which)
         # who is next to its target keeps the same little way ahead of it
@@ -125,14 +132,23 @@ class Pursuit:
         meeting.unchanged[which[~rests]] = 0
 
     def _goes_on(self, arms: Arms, which: Array, targets: Array) -> Mask:
-        """Which arms (A,) go on to the other side of a hole, or wait there for targets (A, width)."""
-        meeting = arms.meeting
-        place, velocity = meeting.place[which], meeting.velocity[which]
+        """Which arms (A,) go on to the other side of a hole, or wait there for targets (A, width).
+
+        There, they will be turned as these are now.
+        """
+        meeting, place = arms.meeting, arms.meeting.place[which]
+        across = meeting.across[which]
+        if not some(across):
+            return across
+        gap, velocity = self.follower.task.gap_of_few, meeting.velocity[which]
         ahead = self._steps_ahead(place, targets, velocity)
-        aside = norms((place - self._on_way(targets, velocity, ahead[:, None])[:, 0])[:, : velocity.shape[1]])
-        there = self.follower.task.gap_of_few(arms.p[which], place) <= _THERE
+        on_way = self._on_way(targets, velocity, ahead[:, None])[:, 0]
+        aside = norms((place - on_way)[:, : velocity.shape[1]])
+        late = (ahead <= 0.0) & ((gap(arms.p[which], place) <= _THERE) | (ahead < -_TOO_LATE * self.rate))
         # comparison with NaN, where there is no place, is false
-        return meeting.across[which] & (aside < _ASIDE) & ((ahead > 0.0) | ~there)
+        goes_on = across & (aside < _ASIDE) & ~late
+        meeting.place[which[goes_on], velocity.shape[1] :] = targets[goes_on, velocity.shape[1] :]
+        return goes_on
 
     def _steps_ahead(self, points: Array, targets: Array, velocity: Array) -> Array:
         """Of how many steps of targets (A, width) points (A, width) are ahead (A,), along velocities (A, d)."""
@@ -142,6 +158,7 @@ class Pursuit:
     def _look(self, arms: Arms, which: Array, targets: Array, behind: Mask) -> None:
         """Looks for where arms (A,) meet targets (A, width); those that are not `behind` (A,) may wait."""
         meeting, steps, rows = arms.meeting, self._ahead, np.arange(len(which))
+        gap = self.follower.task.gap_of_few
         velocity = meeting.velocity[which]
         points = self._on_way(targets, velocity, steps)
         open_, needs = self._needs(arms.q[which], points)
@@ -154,36 +171,38 @@ class Pursuit:
         shut[:, 0] |= ~behind
         beyond = open_ & known & np.logical_or.accumulate(shut, axis=1) & (needs >= _FAR * self.rate)
         out = beyond.argmax(1)
-        across = beyond.any(1) & ~near & (behind | (needs[rows, out] + _EVERY >= steps[out]))
+        # it must be possible to meet somewhere there, if not where the target comes out
+        across = (in_time & beyond).any(1) & ~near
+        across &= (behind & ~open_[:, 0]) | (needs[rows, out] + self._every >= steps[out])
         far = across.nonzero()[0]
         if len(far):
-            times, found, there = self._beyond(arms.q[which[far]], points[far], out[far])
-            across[far] = found & (behind[far] | (there >= times))
-            far, times = far[across[far]], times[across[far]]
-            goals[far] = times
-        meeting.caught_up[which] = np.where(near, meeting.caught_up[which] + _EVERY, 0)
+            meet_at, found, needed_there = self._beyond(arms.q[which[far]], points[far], known[far], out[far])
+            across[far] = found & (behind[far] | (needed_there >= meet_at))
+            goals[far] = np.where(across[far], meet_at, goals[far])
+        meeting.caught_up[which] = np.where(near, meeting.caught_up[which] + self._every, 0)
         meets = (across | in_time.any(1) & behind) & (goals > 0.0)
         meets &= meeting.caught_up[which] < _CAUGHT_UP * self.rate
         # who is at its target does not leave it for a hole ahead; guesses beside one are rough
-        there = behind & self.follower.same_goal(arms.p[which], targets)
-        meets &= ~(there & (across | (needed >= _FAR * self.rate)))
+        at_target = behind & self.follower.same_goal(arms.p[which], targets)
+        meets &= ~(at_target & (across | (needed >= _FAR * self.rate)))
         meeting.across[which] = across & meets
         # along the way, from where the arm is
-        mine = self._steps_ahead(arms.p[which], targets, velocity)
-        some_way = mine + _CHORD * (goals - mine) / np.maximum(needed, 1.0)
+        mine = np.maximum(self._steps_ahead(arms.p[which], targets, velocity), -1.0 * meeting.going[which])
+        some_way = mine + _CHORD * self.rate * (goals - mine) / np.maximum(needed, 1.0)
         follows = ~across & ~near & (mine < 0.0) & (some_way < goals)
         place = self._on_way(targets, velocity, np.where(follows, some_way, goals)[:, None])[:, 0]
-        gap, last = self.follower.task.gap_of_few, meeting.place[which]
+        last = meeting.place[which]
         kept = ~across & ~follows & (gap(place, last) < _MOVED * gap(arms.p[which], last))
         meeting.place[which[meets & ~kept]] = place[meets & ~kept]
         meeting.place[which[~meets]] = np.nan
 
-    def _beyond(self, q: Array, points: Array, out: Array) -> tuple[Array, Mask, Array]:
+    def _beyond(self, q: Array, points: Array, known: Mask, out: Array) -> tuple[Array, Mask, Array]:
         """Where arms at configurations (R, n) are to meet targets that come out of holes.
 
         Args:
             q: (R, n).
-            points: (R, K, width) where the targets will be.
+            points: (R, K, width) where the targets will be,
+            known: (R, K) and up to where they are taken to go on so.
             out: (R,) the first of these that are likely on the other side.
 
         Returns:
@@ -194,16 +213,19 @@ class Pursuit:
         looked, times = points[rows[:, None], index], steps[index]
         solved, solvable, _ = solve_few(self.follower, self.solver, looked.reshape(-1, points.shape[2]))
         ways, valid = solved.reshape(*index.shape, -1), solvable.reshape(index.shape)
+        valid &= known[rows[:, None], index]
         passed = np.diff(times, axis=1)
         pace = self.follower.duration(np.nan_to_num(self.follower.difference(ways[:, :-1], ways[:, 1:])))
         followed = valid[:, :-1] & valid[:, 1:] & (passed > 0.0) & (pace <= _STEEP * passed)
         exits, motion = followed.argmax(1), np.nan_to_num(self.follower.difference(q[:, None], ways))
         half = np.abs(motion[rows, exits][:, self._turning]).max(1, initial=0.0) >= _HALF_TURN
         after = times[rows, exits] + np.where(half, _LATER * self.rate, 0.0)
-        late = valid & (times >= after[:, None])
-        chosen = np.where(late.any(1), late.argmax(1), exits)
+        # between two points that the map has configurations for, if there are such
+        last = np.minimum((times < after[:, None]).sum(1), times.shape[1] - 1)
+        fits = valid[rows, last] & valid[rows, np.maximum(last - 1, 0)] & (times[rows, last] >= after)
+        chosen = np.where(fits, last, exits)
         needs = self.follower.duration(motion[rows, chosen])
-        return np.minimum(after, times[rows, chosen]), np.asarray(followed.any(1)), needs
+        return np.where(fits, after, times[rows, exits]), np.asarray(followed.any(1)), needs
 
     def _needs(self, q: Array, points: Array) -> tuple[Mask, Array]:
         """Which points (A, K, width) are likely open (A, K), and the steps there (A, K) from configurations (A, n)."""
