@@ -8,6 +8,9 @@ import torch
 import grr_torch
 from grr_torch import Teleoperator
 
+# the most that a joint moves in a step, as in the paper's experiment [rad]
+STEP = 0.04
+
 
 def some_vertices(roadmap: grr_torch.Roadmap, count: int, seed: int = 0) -> torch.Tensor:
     """Resolved vertices, drawn at random."""

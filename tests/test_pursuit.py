@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from teleoperated import follow_targets, some_vertices
+from teleoperated import STEP, follow_targets, some_vertices
 
 import grr_torch
 from grr_torch import Teleoperator
-from grr_torch.applications import pursuit
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.lines import Follower
 from grr_torch.applications.pursuit import Pursuit
@@ -18,8 +17,6 @@ from grr_torch.experiments.paths import draw_paths
 from grr_torch.experiments.teleoperation import starts
 from grr_torch.projection.project import DEFAULT_TOLERANCES
 from grr_torch.spaces.configuration import difference
-
-STEP = 0.04
 
 
 @pytest.fixture(scope="module")
@@ -90,59 +87,6 @@ def test_an_arm_that_has_caught_up_follows_its_target_again(roadmap, through_hol
     assert float((status[-300:] == "tracking").mean()) > 0.95
 
 
-def _led(roadmap, targets):
-    """Tools (steps, arms, 3), where arms meet targets (steps, arms, 3), and whether across a hole (steps, arms)."""
-    teleoperator = Teleoperator(roadmap, start=starts(roadmap, targets[0]), max_step=STEP)
-    tools, places, across = [], [], []
-    for target in targets:
-        teleoperator.step(target)
-        arms = teleoperator._arms
-        tools.append(arms.p.copy())
-        places.append(arms.meeting.place.copy())
-        across.append(arms.meeting.across & arms.meeting.planned(np.arange(targets.shape[1])))
-    return np.stack(tools), np.stack(places), np.stack(across)
-
-
-def test_where_arms_meet_their_targets_across_a_hole_stays_the_same(roadmap, through_holes):
-    """As long as these go straight on: who heads elsewhere in the middle of a swing has come a longer way."""
-    tools, places, across = _led(roadmap, through_holes)
-    crossing = across.any(0).nonzero()[0]
-    assert len(crossing) >= 30
-    once = [len(np.unique(places[across[:, arm], arm].round(6), axis=0)) == 1 for arm in crossing]
-    assert np.mean(once) >= 0.9
-    came = [np.linalg.norm(tools[across[:, arm], arm] - places[across[:, arm], arm], axis=1)[-1] for arm in crossing]
-    assert np.mean(np.array(came) < 0.03) >= 0.9
-    # it is where the map has a configuration
-    ends = np.stack([places[across[:, arm], arm][0] for arm in crossing])
-    assert roadmap.solve(torch.from_numpy(ends)).valid.double().mean() >= 0.95
-
-
-def test_who_is_behind_catches_up_along_the_way(roadmap, through_holes):
-    """From where an arm has met its target's way beyond a hole on, it does not leave it any more."""
-    tools, _, across = _led(roadmap, through_holes)
-    way = (through_holes[-1] - through_holes[0]).numpy()
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    offsets = tools - through_holes[0].numpy()
-    aside = np.linalg.norm(offsets - (offsets * way).sum(2, keepdims=True) * way, axis=2)
-    widest = []
-    for arm in (across.any(0) & ~across[-1]).nonzero()[0]:
-        after = int(across[:, arm].nonzero()[0][-1]) + 1
-        met = after + (aside[after:, arm] < 0.01).argmax()
-        widest.append(aside[met:, arm].max())
-    assert len(widest) >= 30
-    assert np.mean(np.array(widest) < 0.03) >= 0.9
-
-
-@pytest.mark.parametrize("back_at", [110, 140])
-def test_arms_turn_round_with_their_targets(roadmap, through_holes, back_at):
-    """Targets that turn in the hole and go back, while arms are on their way to the other side."""
-    targets = torch.cat([through_holes[:back_at], through_holes[:back_at].flip(0), through_holes[:1].repeat(150, 1, 1)])
-    tools, _, across = _led(roadmap, targets)
-    assert across[back_at - 1].any()
-    assert not across[back_at + 10 : back_at + 20, across[back_at - 1]].any()
-    assert np.linalg.norm(tools[-1] - targets[-1].numpy(), axis=1).max() < 0.01
-
-
 def test_targets_that_cross_later_than_they_turn_are_met_too(roadmap, through_holes):
     """A corner shortly before a hole: what is known to go straight for a moment only is followed all the same."""
     along = through_holes[1] - through_holes[0]
@@ -160,50 +104,6 @@ def test_foresight_brings_no_arm_farther_behind(roadmap, through_holes, foresigh
     assert _behind(ahead, through_holes) < 1.02 * _behind(without, through_holes)
     if foresight >= 2.0:
         assert _behind(ahead, through_holes) < 0.8 * _behind(without, through_holes)
-
-
-def test_targets_that_cross_the_middle_of_a_hole_are_met_later(roadmap, through_holes, monkeypatch):
-    """A quarter of a second beyond where the map can be followed again, if a joint has to make half a turn for it."""
-    longest = torch.full((7,), STEP, dtype=torch.float64)
-    follower = Follower(roadmap.robot, roadmap.task, DEFAULT_TOLERANCES, longest)
-    instance = Pursuit(follower, roadmap.solver, 50.0, 2.0)
-    solution = roadmap.solve(through_holes[[40, 100]])
-    inside = solution.valid[0] & ~solution.valid[1]
-    q = solution.configurations[0][inside].numpy()
-    points = (
-        through_holes[60 + torch.from_numpy(instance._ahead).long()][:, inside].transpose(0, 1).contiguous().numpy()
-    )
-    assert len(q) >= 10
-    open_, _ = instance._needs(q, points)
-    out = (open_ & np.logical_or.accumulate(~open_, axis=1)).argmax(1)
-    found = []
-    for later in (0.0, pursuit._LATER):
-        monkeypatch.setattr(pursuit, "_LATER", later)
-        times, there, _ = instance._beyond(q, points, np.ones_like(open_), out)
-        found.append(times[there])
-        rows = there.nonzero()[0]
-        met = torch.from_numpy(np.rint(60 + times[there])).long()
-        ends = roadmap.solve(through_holes[met, inside.nonzero()[:, 0][rows]])
-        assert ends.valid.double().mean() > 0.95
-        if later == 0.0:
-            turns = difference(torch.from_numpy(q[rows]), ends.configurations, roadmap.robot.continuous).abs().amax(1)
-    added = found[1] - found[0]
-    half = (turns > pursuit._HALF_TURN + 0.1).numpy()
-    assert half.sum() >= 10
-    assert np.median(added[half]) == pytest.approx(50.0 * pursuit._LATER)
-    assert (added >= 0.0).all()
-
-
-def test_targets_beside_the_middle_are_met_as_soon_as_they_can_be(roadmap, monkeypatch):
-    paths = draw_paths(roadmap, "line_random", 100, seed=3).transpose(0, 1)
-    met = []
-    for later in (0.0, pursuit._LATER):
-        monkeypatch.setattr(pursuit, "_LATER", later)
-        met.append(_led(roadmap, paths))
-    crossing = met[0][2].any(0)
-    assert crossing.sum() >= 10
-    same = (met[0][0] == met[1][0]).all(axis=(0, 2))
-    assert same[crossing].mean() > 0.7
 
 
 def _watched(roadmap, targets, rate, seen):
