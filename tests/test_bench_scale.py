@@ -56,7 +56,8 @@ def test_processor_time_is_that_of_forked_processes_too():
     before, alone = scale._processor_seconds(), time.process_time()
     burn = "import time\nwhile time.process_time() < 0.5: pass"
     subprocess.run([sys.executable, "-c", burn], check=True)
-    assert scale._processor_seconds() - before >= 0.5 > time.process_time() - alone
+    # the system counts in hundredths of a second
+    assert scale._processor_seconds() - before > 0.45 > time.process_time() - alone
 
 
 @pytest.mark.parametrize("task", ["position", "pose"])
