@@ -11,6 +11,7 @@ from random_robots import BOX_ARM
 
 import grr_torch
 from grr_torch import NeuralIK, TrainingOptions, train_ik
+from grr_torch.experiments.paths import draw_paths
 from grr_torch.learning.network import Architecture
 
 # how long an example takes is the machine's affair
@@ -39,6 +40,12 @@ def planar_roadmap(planar_5) -> grr_torch.Roadmap:
 def kinova_roadmap(kinova) -> grr_torch.Roadmap:
     """The Kinova's, gripper down, refined."""
     return grr_torch.build(kinova, "fixed-rotation")
+
+
+@pytest.fixture(scope="session")
+def through_holes(kinova_roadmap) -> torch.Tensor:
+    """Targets (200, 40, 3) on lines through the Kinova's base."""
+    return draw_paths(kinova_roadmap, "line_self", 40, seed=3).transpose(0, 1)
 
 
 @pytest.fixture(scope="session")

@@ -23,12 +23,6 @@ def roadmap(kinova_roadmap) -> grr_torch.Roadmap:
     return kinova_roadmap
 
 
-@pytest.fixture(scope="module")
-def through_holes(roadmap) -> torch.Tensor:
-    """Targets (200, 40, 3) on lines through the robot's base."""
-    return draw_paths(roadmap, "line_self", 40, seed=3).transpose(0, 1)
-
-
 def _led(roadmap, targets):
     """Tools (steps, arms, 3), where arms meet targets (steps, arms, 3), and whether across a hole (steps, arms)."""
     teleoperator = Teleoperator(roadmap, start=starts(roadmap, targets[0]), max_step=STEP)
@@ -106,9 +100,8 @@ def test_targets_that_cross_the_middle_of_a_hole_are_met_later(roadmap, through_
     solution = roadmap.solve(through_holes[[40, 100]])
     inside = solution.valid[0] & ~solution.valid[1]
     q = solution.configurations[0][inside].numpy()
-    points = (
-        through_holes[60 + torch.from_numpy(instance._ahead).long()][:, inside].transpose(0, 1).contiguous().numpy()
-    )
+    ahead = through_holes[60 + torch.from_numpy(instance._ahead).long()]
+    points = ahead[:, inside].transpose(0, 1).contiguous().numpy()
     assert len(q) >= 10
     open_, _ = instance._needs(q, points)
     out = (open_ & np.logical_or.accumulate(~open_, axis=1)).argmax(1)
