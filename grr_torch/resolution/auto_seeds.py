@@ -44,7 +44,7 @@ _ITERATIONS = 8
 _NEIGHBOURS = 24
 # share of the candidates that are relaxed on it, and of those that are tried on the task graph itself
 _RELAXED = 0.16
-_FINALISTS = 0.03
+_FINALISTS = 0.06
 # in so many rounds each
 _ROUNDS = 5
 _FINAL_ROUNDS = 3
