@@ -68,7 +68,7 @@ class _Incidence(NamedTuple):
         vertices, count = edges.flatten(), edges.shape[1]
         order = vertices.argsort(stable=True)
         counts = vertices.bincount(minlength=like.shape[1])
-        signs = torch.where(order < count, like.new_tensor(1.0), -1.0)
+        signs = torch.where(order < count, 1.0, -1.0).to(like)
         return _Incidence(counts.cumsum(0) - counts, order % count, edges.flip(0).flatten()[order], signs, counts)
 
     def gather(self, forces: Tensor) -> Tensor:

@@ -231,6 +231,13 @@ class Robot:
         lower, upper = (limit[:, None] for limit in (self.lower - tolerance, self.upper + tolerance))
         return ((columns >= lower) & (columns <= upper)).all(0).reshape(q.shape[:-1])
 
+    @cached_property
+    def _sampling_range(self) -> tuple[Tensor, Tensor]:
+        kinds = [self.urdf.joints[name].kind for name in self.joint_names]
+        limits = zip(kinds, self.lower.tolist(), self.upper.tolist(), strict=True)
+        lower, upper = self.lower.new_tensor([sampling_range(*limit) for limit in limits]).T
+        return lower, upper
+
     def sample(self, k: int, generator: torch.Generator | None = None) -> Tensor:
         """Draws (k, n) configurations, uniform within limits; ±π rad or ±1 m where a joint has none.
 
@@ -243,9 +250,7 @@ class Robot:
         """
         if k < 0:
             raise ParameterError("k", k, "0 or more")
-        kinds = [self.urdf.joints[name].kind for name in self.joint_names]
-        limits = zip(kinds, self.lower.tolist(), self.upper.tolist(), strict=True)
-        lower, upper = self.lower.new_tensor([sampling_range(*limit) for limit in limits]).T
+        lower, upper = self._sampling_range
         # drawn on the CPU, so that a seed gives the same configurations on every device
         unit = torch.rand(k, self.n, dtype=self.dtype, generator=generator).to(self.device)
         return lower + (upper - lower) * unit

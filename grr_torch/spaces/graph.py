@@ -14,6 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from grr_torch.devices import OnDevices
 from grr_torch.errors import ParameterError, check_whole
 from grr_torch.spaces.cliques import closed, triangles
 from grr_torch.spaces.lattice import Lattice
@@ -95,18 +96,22 @@ class TaskGraph:
         rows = csr_matrix((np.ones(len(both[0]), dtype=np.int8), both), shape=(len(self.points),) * 2)
         return torch.from_numpy(rows.indptr.astype(np.int64)), torch.from_numpy(rows.indices.astype(np.int64))
 
+    @cached_property
+    def _rows(self) -> OnDevices:
+        return OnDevices(*self.adjacency)
+
     def around(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
         """The neighbours along edges of some vertices (F,), one after the other.
 
         Returns:
             Ranks (K,) in `vertices`, which say whose neighbour it is, and the neighbours (K,).
         """
-        starts, ends = self.adjacency
-        chosen = vertices.cpu()
-        counts = starts[chosen + 1] - starts[chosen]
-        rank = torch.repeat_interleave(torch.arange(len(chosen)), counts)
-        places = torch.arange(len(rank)) + (starts[chosen] - counts.cumsum(0) + counts)[rank]
-        return rank.to(vertices.device), ends[places].to(vertices.device)
+        device = vertices.device
+        starts, ends = self._rows.at(device)
+        counts = starts[vertices + 1] - starts[vertices]
+        rank = torch.repeat_interleave(torch.arange(len(vertices), device=device), counts)
+        places = torch.arange(len(rank), device=device) + (starts[vertices] - counts.cumsum(0) + counts)[rank]
+        return rank, ends[places]
 
     def triangles(self, kept: Tensor) -> Tensor:
         """(C, 3) triangles of those edges that are kept (E,), smallest vertex first."""

@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from grr_torch.devices import OnDevices
+
 
 @dataclass(frozen=True)
 class Lattice:
@@ -29,7 +31,7 @@ class Lattice:
 
     def neighbours(self, vertices: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """Indices (F, K) and distances (F, K) [m] of the k nearest vertices, as `TaskGraph.neighbours` gives them."""
-        displacements, lengths = (part.to(vertices.device) for part in _stencil(self, k))
+        displacements, lengths = _stencil(self, k).at(vertices.device)
         index = vertices.new_zeros(len(vertices), len(lengths))
         inside = torch.ones_like(index, dtype=torch.bool)
         corners = math.prod(count + 1 for count in self.cells)
@@ -118,7 +120,7 @@ class Lattice:
 
 
 @functools.lru_cache(maxsize=32)
-def _stencil(lattice: Lattice, k: int) -> tuple[Tensor, Tensor]:
+def _stencil(lattice: Lattice, k: int) -> OnDevices:
     """Displacements (K, d) in half cells and their lengths (K,) [m], nearest first; none longer than the grid."""
     limits = [2 * count for count in lattice.cells]
     half = [0.5 * length for length in lattice.spacing]
@@ -135,4 +137,5 @@ def _stencil(lattice: Lattice, k: int) -> tuple[Tensor, Tensor]:
         reach += 1
     last = lengths[order[min(k, len(order)) - 1]] * (1.0 + 1e-9)
     order = [i for i in order if lengths[i] <= last]
-    return torch.tensor([offsets[i] for i in order]), torch.tensor([lengths[i] for i in order], dtype=torch.float64)
+    chosen, far = [offsets[i] for i in order], [lengths[i] for i in order]
+    return OnDevices(torch.tensor(chosen), torch.tensor(far, dtype=torch.float64))

@@ -14,6 +14,7 @@ import torch
 from scipy.sparse import csr_matrix, eye_array
 from torch import Tensor
 
+from grr_torch.devices import OnDevices
 from grr_torch.errors import ParameterError
 from grr_torch.spaces.base import ROTATION_WEIGHT, TRANSLATION_WEIGHT, TaskSpace
 from grr_torch.spaces.cliques import closed, draw, triangles
@@ -57,7 +58,7 @@ class ProductGraph(TaskGraph):
         indices: list[Tensor] = []
         distances: list[Tensor] = []
         for hops in range(k + 1):
-            rings, lengths = (part.to(vertices.device)[turn] for part in self._ring(hops))
+            rings, lengths = (part[turn] for part in self._rings[hops].at(vertices.device))
             near, apart = self._places(place, k - hops, itself=hops > 0)
             there = rings >= 0
             index = torch.where(there, rings, 0)[:, :, None] * size + near[:, None]
@@ -71,7 +72,7 @@ class ProductGraph(TaskGraph):
         size = len(self.positions.points)
         place, turn = vertices % size, vertices // size
         rank, near = self.positions.around(place)
-        rings = self._ring(1)[0].to(vertices.device)[turn]
+        rings = self._rings[1].at(vertices.device)[0][turn]
         rows, columns = (rings >= 0).nonzero().unbind(1)
         ranks = torch.cat([rank, rows])
         others = torch.cat([turn[rank] * size + near, rings[rows, columns] * size + place[rows]])
@@ -88,18 +89,15 @@ class ProductGraph(TaskGraph):
             return places.new_empty(len(places), 0), places.new_empty(len(places), 0, dtype=torch.float64)
         return torch.cat([near for near, _ in found], dim=1), torch.cat([apart for _, apart in found], dim=1)
 
-    def _ring(self, hops: int) -> tuple[Tensor, Tensor]:
-        """Rotations (R, M) exactly so many edges away, −1 where there are fewer, and how far they are in D_p."""
-        return self._rings[hops]
-
     @cached_property
-    def _rings(self) -> list[tuple[Tensor, Tensor]]:
+    def _rings(self) -> list[OnDevices]:
+        """By edges: rotations (R, M) exactly so many away, −1 where there are fewer, and how far they are in D_p."""
         values, edges = self.rotations.values, self.rotations.edges.numpy()
         count = len(values)
         joined = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
         joined = joined + joined.T
         seen = eye_array(count, format="csr")
-        rings = [(torch.arange(count)[:, None], torch.zeros(count, 1, dtype=torch.float64))]
+        rings = [OnDevices(torch.arange(count)[:, None], torch.zeros(count, 1, dtype=torch.float64))]
         within = seen
         for _ in range(MOST_HOPS):
             within = ((within @ joined + within) > 0).astype(np.float64)
@@ -108,7 +106,7 @@ class ProductGraph(TaskGraph):
             seen = within
             table = _padded(ring.indptr, ring.indices, count)
             apart = self.space.distance(values[:, None], values[table.clamp_min(0)])
-            rings.append((table, ROTATION_WEIGHT * apart))
+            rings.append(OnDevices(table, ROTATION_WEIGHT * apart))
         return rings
 
     def nearest(self, points: Tensor, k: int = 1) -> Tensor:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from grr_torch.devices import OnDevices
 from grr_torch.errors import ParameterError, UnknownNameError
 from grr_torch.pieces import Array
 from grr_torch.spaces.base import ROTATION_WEIGHT, TRANSLATION_WEIGHT, TaskSpace
@@ -83,19 +84,23 @@ class FixedRotation(TaskSpace):
         return matrix_from_rpy(*self.rpy)
 
     @cached_property
+    def _rotation(self) -> OnDevices:
+        return OnDevices(self.rotation)
+
+    @cached_property
     def _turning(self) -> tuple[Array, Array]:
         target = self.rotation.numpy()
         return target, turning_terms(target)
 
     def matrices(self, targets: Tensor) -> Tensor:
         """The one rotation, for every point."""
-        return self.rotation.to(targets)[..., None]
+        return self._rotation.like(targets)[0][..., None]
 
     def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
         """Rotation vectors (3, N) in space, wrapped yaw differences (1, N) in the plane [rad]."""
         if self.dimension == 2:
             return wrap(self.rpy[2] - torch.atan2(rotation[1, 0], rotation[0, 0]))[None]
-        return rotation_error(self.rotation.to(rotation)[..., None], rotation)
+        return rotation_error(self._rotation.like(rotation)[0][..., None], rotation)
 
     def rotation_error_of_few(self, targets: Array, rotation: Array) -> Array:
         """`rotation_error` for arrays."""

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from grr_torch.devices import OnDevices
 from grr_torch.errors import ParameterError
 from grr_torch.spaces.base import TaskSpace
 from grr_torch.spaces.configuration import wrap
@@ -49,7 +50,7 @@ class Pose(TaskSpace):
         """Those of the quaternions, or of the yaws about z."""
         if self.dimension == 3:
             return matrix_from_quaternion(targets[3:])
-        return _turns(_Z, torch.eye(3, dtype=targets.dtype, device=targets.device), targets[2])
+        return _turned(_YAWED, targets[2])
 
     def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
         """Rotation vectors (3, N) in space, wrapped yaw differences (1, N) in the plane [rad]."""
@@ -92,6 +93,10 @@ class _OfSpace(TaskSpace):
         length = math.hypot(x, y, z)
         return (x / length, y / length, z / length)
 
+    @cached_property
+    def _unit_axis(self) -> OnDevices:
+        return OnDevices(torch.tensor(self.unit_axis, dtype=torch.float64))
+
 
 @dataclass(frozen=True)
 class Yaw(_OfSpace):
@@ -130,9 +135,13 @@ class Yaw(_OfSpace):
         """The tool's rotation matrix (3, 3) at yaw 0."""
         return matrix_from_rpy(*self.rpy)
 
+    @cached_property
+    def _turning(self) -> OnDevices:
+        return _turning(self.unit_axis, self.rotation)
+
     def matrices(self, targets: Tensor) -> Tensor:
         """Those at yaw 0, turned."""
-        return _turns(self.unit_axis, self.rotation.to(targets), targets[3])
+        return _turned(self._turning, targets[3])
 
     def rotation_error(self, targets: Tensor, rotation: Tensor) -> Tensor:
         """Rotation vectors (3, N) [rad]."""
@@ -140,9 +149,9 @@ class Yaw(_OfSpace):
 
     def at(self, position: Tensor, rotation: Tensor) -> Tensor:
         """The yaws at which the tool comes nearest to its rotation."""
-        turn = rotation.permute(2, 0, 1) @ self.rotation.to(rotation).T
+        turn = rotation.permute(2, 0, 1) @ self._turning.like(rotation)[0].T
         quaternion = quaternion_from_matrix(turn)
-        along = quaternion[:, 1:] @ quaternion.new_tensor(self.unit_axis)
+        along = quaternion[:, 1:] @ self._unit_axis.like(quaternion)[0]
         return torch.cat([position, wrap(2.0 * torch.atan2(along, quaternion[:, 0]))[None]])
 
     def to_json(self) -> dict[str, Any]:
@@ -193,7 +202,7 @@ class Axis(_OfSpace):
         basis = perpendicular(wanted)
         error = (basis * across[:, None]).sum(0) * (angle / sine.clamp_min(1e-300))
         opposite = (sine < 1e-12) & (angle > 1.0)
-        return torch.where(opposite, angle * angle.new_tensor([[1.0], [0.0]]), error)
+        return torch.where(opposite, torch.stack([angle, torch.zeros_like(angle)]), error)
 
     def jacobian(self, jacobian: Tensor, targets: Tensor | None = None) -> Tensor:
         """The rows of position, and those of rotation in the basis perpendicular to the targets' directions."""
@@ -209,16 +218,24 @@ class Axis(_OfSpace):
 
     def _along(self, rotation: Tensor) -> Tensor:
         """The axis in the base frame (3, N)."""
-        return torch.einsum("ijN,j->iN", rotation, rotation.new_tensor(self.unit_axis))
+        return torch.einsum("ijN,j->iN", rotation, self._unit_axis.like(rotation)[0])
 
     def to_json(self) -> dict[str, Any]:
         """Kind, dimension and axis."""
         return {"kind": self.kind, "dimension": self.dimension, "axis": list(self.axis)}
 
 
-def _turns(axis: tuple[float, float, float], rotation: Tensor, angles: Tensor) -> Tensor:
-    """A rotation (3, 3) turned about an axis by angles (N,): (3, 3, N), by Rodrigues' formula."""
+def _turning(axis: tuple[float, float, float], rotation: Tensor) -> OnDevices:
+    """What `_turned` needs of a unit axis and a rotation (3, 3): it, and its factors in Rodrigues' formula."""
     x, y, z = axis
     cross = rotation.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    first, second = cross @ rotation, cross @ cross @ rotation
-    return rotation[..., None] + angles.sin() * first[..., None] + (1.0 - angles.cos()) * second[..., None]
+    return OnDevices(rotation, cross @ rotation, cross @ cross @ rotation)
+
+
+def _turned(turning: OnDevices, angles: Tensor) -> Tensor:
+    """The rotation turned about the axis by angles (N,): (3, 3, N)."""
+    rotation, first, second = (matrix[..., None] for matrix in turning.like(angles))
+    return rotation + angles.sin() * first + (1.0 - angles.cos()) * second
+
+
+_YAWED = _turning(_Z, torch.eye(3, dtype=torch.float64))

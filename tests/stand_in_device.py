@@ -1,0 +1,170 @@
+"""A device that is not there: what a GPU is asked to do, done on the CPU, and every transfer counted.
+
+Its tensors say that they lie on "gpu:0". They compute as those on the CPU do, but an operation that mixes both fails as
+it would on a GPU. So code can be shown to keep its tensors where they belong, and to move few of them, without a GPU.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+
+NAME = "gpu"
+_aten = torch.ops.aten
+# indices may lie on the CPU; they are transferred
+_INDEXED = (_aten.index, _aten.index_put, _aten.index_put_, _aten._index_put_impl_)
+_PACKAGE = Path(__file__).parent.parent / "grr_torch"
+
+
+class Moved(Tensor):
+    """A tensor on the device that is not there; `held` is the one on the CPU that has its values."""
+
+    held: Tensor
+
+    @staticmethod
+    def __new__(cls, held: Tensor) -> Moved:
+        layout = {"strides": held.stride(), "storage_offset": held.storage_offset(), "dtype": held.dtype}
+        return Tensor._make_wrapper_subclass(cls, held.shape, device=f"{NAME}:0", **layout)
+
+    def __init__(self, held: Tensor):
+        self.held = held
+
+    @classmethod
+    def __torch_dispatch__(cls, function, types, args=(), kwargs=None):
+        return _computed(function, args, kwargs or {})
+
+    def tolist(self):
+        return self.cpu().tolist()
+
+    def __repr__(self) -> str:
+        return f"Moved({self.held})"
+
+
+class Transfers:
+    """What was moved between the device and the CPU.
+
+    Attributes:
+        moved: How often, by "to" or "from" the device and the place in the package that asked for it, "file.py:line".
+        sizes: Bytes, by the same.
+        read: How often single numbers were waited for (to branch on, or as the size of a result), by place.
+    """
+
+    def __init__(self) -> None:
+        self.moved: Counter[tuple[str, str]] = Counter()
+        self.sizes: Counter[tuple[str, str]] = Counter()
+        self.read: Counter[str] = Counter()
+
+    def count(self, way: str, size: int) -> None:
+        """Counts a transfer of so many bytes "to" or "from" the device."""
+        key = (way, _place())
+        self.moved[key] += 1
+        self.sizes[key] += size
+
+    def within(self, *files: str) -> dict[tuple[str, str], int]:
+        """Of `moved`, what these files of the package asked for."""
+        return {key: count for key, count in self.moved.items() if key[1].split(":")[0] in files}
+
+
+_transfers = Transfers()
+
+
+def _place() -> str:
+    for frame in reversed(traceback.extract_stack()):
+        if Path(frame.filename).is_relative_to(_PACKAGE):
+            return f"{Path(frame.filename).name}:{frame.lineno}"
+    return "elsewhere"
+
+
+def _held(value):
+    return value.held if isinstance(value, Moved) else value
+
+
+def _is_there(device) -> bool:
+    return device is not None and torch.device(device).type == NAME
+
+
+def _computed(function, args, kwargs):
+    name = function.overloadpacket
+    if name is _aten._to_copy:
+        return _copied(*args, **kwargs)
+    if name is _aten.copy_:
+        target, source = args[:2]
+        if isinstance(target, Moved) != isinstance(source, Moved):
+            _transfers.count("to" if isinstance(target, Moved) else "from", target.nbytes)
+        _held(target).copy_(_held(source))
+        return target
+    given = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
+    ours = [value for value in given if isinstance(value, Moved)]
+    # as on a GPU, numbers that are tensors of no dimension go along with the call
+    foreign = [value for value in given if not isinstance(value, Moved) and value.ndim > 0] if ours else []
+    for value in foreign:
+        if name not in _INDEXED or not isinstance(args[0], Moved):
+            shapes = [tuple(one.shape) for one in ours]
+            raise RuntimeError(f"{function}: of its tensors, {shapes} are on {NAME}, {tuple(value.shape)} is not")
+        _transfers.count("to", value.nbytes)
+    if ours and name in (_aten._local_scalar_dense, _aten.nonzero, _aten.equal, _aten._unique2, _aten.masked_select):
+        _transfers.read[_place()] += 1
+    device = kwargs.get("device")
+    out = function(*tree_map(_held, args), **tree_map(_held, {**kwargs, **({"device": "cpu"} if device else {})}))
+    if not (_is_there(device) if device else ours):
+        return out
+    # what was changed in place stays the tensor that it is
+    same = {id(value.held): value for value in ours}
+    return tree_map(lambda value: same[id(value)] if id(value) in same else _moved(value), out)
+
+
+def _moved(value):
+    return Moved(value) if isinstance(value, Tensor) else value
+
+
+def _copied(source: Tensor, *, device=None, pin_memory=None, **kwargs) -> Tensor:
+    out = _aten._to_copy(_held(source), **kwargs, device="cpu")
+    there = isinstance(source, Moved) if device is None else _is_there(device)
+    if there != isinstance(source, Moved):
+        _transfers.count("to" if there else "from", out.nbytes)
+    return Moved(out) if there else out
+
+
+class _NewTensors(TorchDispatchMode):
+    """Tensors that are made of nothing are made on the device, if they are asked for there."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        return _computed(function, args, kwargs or {})
+
+
+def _from_lists(library: torch.library.Library) -> None:
+    """Lists of numbers are copied to the device by calls that no mode sees."""
+
+    def empty_strided(size, stride, dtype=None, layout=None, device=None, pin_memory=None):
+        return Moved(torch.empty_strided(size, stride, dtype=dtype))
+
+    def copy_from(source, target, non_blocking=False):
+        _transfers.count("to", source.nbytes)
+        target.held.copy_(source)
+        return target
+
+    library.impl("empty_strided", empty_strided, "PrivateUse1")
+    library.impl("_copy_from", copy_from, "PrivateUse1")
+
+
+_setup_privateuseone_for_python_backend(NAME)
+_library = torch.library.Library("aten", "IMPL")
+_from_lists(_library)
+
+
+@contextmanager
+def stand_in() -> Iterator[Transfers]:
+    """Within it there is a device `NAME`; tells what is moved."""
+    global _transfers
+    _transfers = Transfers()
+    with _NewTensors():
+        yield _transfers
