@@ -6,7 +6,7 @@ it would on a GPU. So code can be shown to keep its tensors where they belong, a
 
 from __future__ import annotations
 
-import traceback
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,14 +15,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 NAME = "gpu"
 _aten = torch.ops.aten
 # indices may lie on the CPU; they are transferred
 _INDEXED = (_aten.index, _aten.index_put, _aten.index_put_, _aten._index_put_impl_)
-_PACKAGE = Path(__file__).parent.parent / "grr_torch"
+_PACKAGE = str(Path(__file__).parent.parent / "grr_torch")
 
 
 class Moved(Tensor):
@@ -73,14 +72,20 @@ class Transfers:
         """Of `moved`, what these files of the package asked for."""
         return {key: count for key, count in self.moved.items() if key[1].split(":")[0] in files}
 
+    def outside(self, *files: str) -> int:
+        """How often anything was moved that these files did not ask for."""
+        return self.moved.total() - sum(self.within(*files).values())
+
 
 _transfers = Transfers()
 
 
 def _place() -> str:
-    for frame in reversed(traceback.extract_stack()):
-        if Path(frame.filename).is_relative_to(_PACKAGE):
-            return f"{Path(frame.filename).name}:{frame.lineno}"
+    frame = sys._getframe(1)
+    while frame is not None:
+        if frame.f_code.co_filename.startswith(_PACKAGE):
+            return f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
+        frame = frame.f_back
     return "elsewhere"
 
 
@@ -102,10 +107,11 @@ def _computed(function, args, kwargs):
             _transfers.count("to" if isinstance(target, Moved) else "from", target.nbytes)
         _held(target).copy_(_held(source))
         return target
-    given = [value for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
+    given: list[Tensor] = []
+    held = [_mapped(lambda value: given.append(value) or _held(value), part) for part in (args, *kwargs.values())]
     ours = [value for value in given if isinstance(value, Moved)]
     # as on a GPU, numbers that are tensors of no dimension go along with the call
-    foreign = [value for value in given if not isinstance(value, Moved) and value.ndim > 0] if ours else []
+    foreign = [value for value in given if not isinstance(value, Moved) and value.ndim > 0] if ours else ()
     for value in foreign:
         if name not in _INDEXED or not isinstance(args[0], Moved):
             shapes = [tuple(one.shape) for one in ours]
@@ -114,16 +120,20 @@ def _computed(function, args, kwargs):
     if ours and name in (_aten._local_scalar_dense, _aten.nonzero, _aten.equal, _aten._unique2, _aten.masked_select):
         _transfers.read[_place()] += 1
     device = kwargs.get("device")
-    out = function(*tree_map(_held, args), **tree_map(_held, {**kwargs, **({"device": "cpu"} if device else {})}))
+    named = dict(zip(kwargs, held[1:], strict=True))
+    out = function(*held[0], **({**named, "device": "cpu"} if device else named))
     if not (_is_there(device) if device else ours):
         return out
     # what was changed in place stays the tensor that it is
     same = {id(value.held): value for value in ours}
-    return tree_map(lambda value: same[id(value)] if id(value) in same else _moved(value), out)
+    return _mapped(lambda value: same[id(value)] if id(value) in same else Moved(value), out)
 
 
-def _moved(value):
-    return Moved(value) if isinstance(value, Tensor) else value
+def _mapped(change, value):
+    """A value, or a list or tuple of them, with its tensors changed."""
+    if isinstance(value, list | tuple):
+        return type(value)([_mapped(change, part) for part in value])
+    return change(value) if isinstance(value, Tensor) else value
 
 
 def _copied(source: Tensor, *, device=None, pin_memory=None, **kwargs) -> Tensor:

@@ -15,8 +15,9 @@ from grr_torch.robots.few_self_collision import FewSpheres
 from grr_torch.robots.kinematics import KinematicTree, place
 from grr_torch.robots.spheres import Sphere, SphereModel
 
-# sphere-pair distances held at once: they should stay in the cache
-_PAIRS_AT_ONCE = {"cpu": 1 << 17, "cuda": 1 << 26}
+# sphere-pair distances held at once: on the CPU they should stay in the cache
+_PAIRS_ON_CPU = 1 << 17
+_PAIRS_ON_GPU = 1 << 26
 # of no more pairs, links filled up to equally many spheres, numpy that places all spheres is faster (but near contact,
 # where it takes up to twice as long), unless filling up makes them so many times as many
 _PAIRS_OF_FEW = 6 << 20
@@ -41,7 +42,7 @@ class _Pair(NamedTuple):
 
         |a|² − 2 a·b + |b|² as one matrix product: 5 multiply-adds a pair of spheres.
         """
-        at_once = max(1, _PAIRS_AT_ONCE[relative.device.type] // self.reach.numel())
+        at_once = max(1, (_PAIRS_ON_CPU if relative.device.type == "cpu" else _PAIRS_ON_GPU) // self.reach.numel())
         for start in range(0, relative.shape[2], at_once):
             part = relative[:, :, start : start + at_once]
             b = place(part, self.second).transpose(0, 1)
