@@ -92,35 +92,86 @@ def test_arms_turn_round_with_their_targets(roadmap, through_holes, back_at):
     assert np.linalg.norm(tools[-1] - targets[-1].numpy(), axis=1).max() < 0.01
 
 
-def test_targets_that_cross_the_middle_of_a_hole_are_met_later(roadmap, through_holes, monkeypatch):
-    """A quarter of a second beyond where the map can be followed again, if a joint has to make half a turn for it."""
+@pytest.fixture
+def ahead_of_holes(roadmap, through_holes):
+    """A pursuit, and what its `_beyond` takes of arms at 40 steps whose targets are in holes at 60: rows, arguments."""
     longest = torch.full((7,), STEP, dtype=torch.float64)
     follower = Follower(roadmap.robot, roadmap.task, DEFAULT_TOLERANCES, longest)
     instance = Pursuit(follower, roadmap.solver, 50.0, 2.0)
     solution = roadmap.solve(through_holes[[40, 100]])
     inside = solution.valid[0] & ~solution.valid[1]
     q = solution.configurations[0][inside].numpy()
-    ahead = through_holes[60 + torch.from_numpy(instance._ahead).long()]
-    points = ahead[:, inside].transpose(0, 1).contiguous().numpy()
+    points = (
+        through_holes[60 + torch.from_numpy(instance._ahead).long()][:, inside].transpose(0, 1).contiguous().numpy()
+    )
     assert len(q) >= 10
     open_, _ = instance._needs(q, points)
     out = (open_ & np.logical_or.accumulate(~open_, axis=1)).argmax(1)
+    return instance, inside.nonzero()[:, 0], (q, points, np.ones_like(open_), out)
+
+
+def test_targets_that_cross_the_middle_of_a_hole_are_met_later(roadmap, through_holes, ahead_of_holes, monkeypatch):
+    """A quarter of a second beyond where the map can be followed again, if a joint has to make half a turn for it."""
+    instance, inside, given = ahead_of_holes
     found = []
     for later in (0.0, pursuit._LATER):
         monkeypatch.setattr(pursuit, "_LATER", later)
-        times, there, _ = instance._beyond(q, points, np.ones_like(open_), out)
+        times, there, _ = instance._beyond(*given)
         found.append(times[there])
         rows = there.nonzero()[0]
         met = torch.from_numpy(np.rint(60 + times[there])).long()
-        ends = roadmap.solve(through_holes[met, inside.nonzero()[:, 0][rows]])
+        ends = roadmap.solve(through_holes[met, inside[rows]])
         assert ends.valid.double().mean() > 0.95
         if later == 0.0:
-            turns = difference(torch.from_numpy(q[rows]), ends.configurations, roadmap.robot.continuous).abs().amax(1)
+            start = torch.from_numpy(given[0][rows])
+            turns = difference(start, ends.configurations, roadmap.robot.continuous).abs().amax(1)
     added = found[1] - found[0]
     half = (turns > pursuit._HALF_TURN + 0.1).numpy()
     assert half.sum() >= 10
     assert np.median(added[half]) == pytest.approx(50.0 * pursuit._LATER)
     assert (added >= 0.0).all()
+
+
+def test_targets_are_met_where_the_map_solves_their_way_from_then_on(
+    roadmap, through_holes, ahead_of_holes, monkeypatch
+):
+    instance, inside, given = ahead_of_holes
+    monkeypatch.setattr(pursuit, "_LATER", 0.0)
+    times, there, _ = instance._beyond(*given)
+    rows = inside[there.nonzero()[0]]
+    every = int(np.diff(instance._ahead)[0])
+    met = torch.from_numpy(np.rint(60 + times[there])).long()
+    before, here, after = (roadmap.solve(through_holes[met + steps, rows]).valid for steps in (-every, 0, every))
+    assert bool((here & after).all())
+    # and no later than that
+    assert before.double().mean() < 0.1
+
+
+@pytest.mark.parametrize("degrees", [20, 30])
+def test_a_place_to_meet_is_given_up_when_the_target_goes_past_it(roadmap, through_holes, degrees):
+    """Targets that bend in the hole, too little to have turned."""
+    bend, steps = 100, np.arange(60)[:, None, None]
+    way = (through_holes[1] - through_holes[0]).numpy()
+    across = np.cross(way, [0.0, 0.0, 1.0])
+    across *= np.linalg.norm(way, axis=1, keepdims=True) / np.linalg.norm(across, axis=1, keepdims=True)
+    angle = np.radians(degrees)
+    bent = np.cos(angle) * way + np.sin(angle) * across
+    targets = torch.cat([through_holes[:bend], torch.from_numpy(through_holes[bend - 1].numpy() + (1 + steps) * bent)])
+    _, places, meets = _led(roadmap, targets)
+    speed = np.linalg.norm(bent, axis=1)
+    kept = 0
+    for arm in meets[bend - 1].nonzero()[0]:
+        direction = bent[arm] / speed[arm]
+
+        def aside(place, arm=arm, direction=direction):
+            offset = place - targets[-1, arm].numpy()
+            return np.linalg.norm(offset - (offset @ direction) * direction)
+
+        kept += aside(places[bend - 1, arm]) > 0.06
+        # by then its mean motion is the new one
+        later = meets[bend + 25 :, arm].nonzero()[0] + bend + 25
+        assert all(aside(places[step, arm]) < 0.06 for step in later)
+    assert kept >= 5
 
 
 def test_targets_beside_the_middle_are_met_as_soon_as_they_can_be(roadmap, monkeypatch):

@@ -40,8 +40,8 @@ _AS_LONG = 1.5
 # what is not so far [s] is come to along the edge of reach
 _FAR = 0.4
 # points from where a target seems to come out of a hole on that are solved, to see from where it can be followed: where
-# its joint motion from one to the next takes no longer than so many times what the target takes
-_SOLVED, _STEEP = 14, 2.0
+# two on end are
+_SOLVED = 14
 # an arm one of whose joints has to make about half a turn [rad], as for a target that goes through the base axis, meets
 # it so much later [s]: the way round is shorter there
 _HALF_TURN, _LATER = 2.95, 0.28
@@ -214,9 +214,7 @@ class Pursuit:
         solved, solvable, _ = solve_few(self.follower, self.solver, looked.reshape(-1, points.shape[2]))
         ways, valid = solved.reshape(*index.shape, -1), solvable.reshape(index.shape)
         valid &= known[rows[:, None], index]
-        passed = np.diff(times, axis=1)
-        pace = self.follower.duration(np.nan_to_num(self.follower.difference(ways[:, :-1], ways[:, 1:])))
-        followed = valid[:, :-1] & valid[:, 1:] & (passed > 0.0) & (pace <= _STEEP * passed)
+        followed = valid[:, :-1] & valid[:, 1:] & (np.diff(times, axis=1) > 0.0)
         exits, motion = followed.argmax(1), np.nan_to_num(self.follower.difference(q[:, None], ways))
         half = np.abs(motion[rows, exits][:, self._turning]).max(1, initial=0.0) >= _HALF_TURN
         after = times[rows, exits] + np.where(half, _LATER * self.rate, 0.0)
