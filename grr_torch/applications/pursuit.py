@@ -30,10 +30,8 @@ _LEAP, _REST = 5.0, 0.05
 _STRAIGHT = 0.8
 # an arm so near [m] to where it meets its target is there
 _THERE = 0.01
-# a place to meet is kept until a better one is farther from it than this share of the way there
-_MOVED = 0.5
-# and one on the other side of a hole as long as it is no farther than this [m] from where its target goes, and that has
-# not come past it for so long [s]
+# a place on the other side of a hole is kept as long as it is no farther than this [m] from where its target goes, and
+# that has not come past it for so long [s]
 _ASIDE, _TOO_LATE = 0.05, 0.6
 # what has gone straight so long is taken to go on for so many times as long
 _AS_LONG = 1.5
@@ -158,7 +156,6 @@ class Pursuit:
     def _look(self, arms: Arms, which: Array, targets: Array, behind: Mask) -> None:
         """Looks for where arms (A,) meet targets (A, width); those that are not `behind` (A,) may wait."""
         meeting, steps, rows = arms.meeting, self._ahead, np.arange(len(which))
-        gap = self.follower.task.gap_of_few
         velocity = meeting.velocity[which]
         points = self._on_way(targets, velocity, steps)
         open_, needs = self._needs(arms.q[which], points)
@@ -191,10 +188,7 @@ class Pursuit:
         some_way = mine + _CHORD * self.rate * (goals - mine) / np.maximum(needed, 1.0)
         follows = ~across & ~near & (mine < 0.0) & (some_way < goals)
         place = self._on_way(targets, velocity, np.where(follows, some_way, goals)[:, None])[:, 0]
-        last = meeting.place[which]
-        kept = ~across & ~follows & (gap(place, last) < _MOVED * gap(arms.p[which], last))
-        meeting.place[which[meets & ~kept]] = place[meets & ~kept]
-        meeting.place[which[~meets]] = np.nan
+        meeting.place[which] = np.where(meets[:, None], place, np.nan)
 
     def _beyond(self, q: Array, points: Array, known: Mask, out: Array) -> tuple[Array, Mask, Array]:
         """Where arms at configurations (R, n) are to meet targets that come out of holes.
