@@ -90,7 +90,8 @@ def measure_roadmaps(
         reachability: Random starts a vertex that tell which are reachable.
         samples: Random configurations a vertex, for the method "random".
         seed: Of all random draws.
-        repeats: Times are medians of so many builds; random, which takes minutes, is built once.
+        repeats: Times are medians of so many builds, of all methods by turns; random, which takes minutes, is built
+            once.
         progress: Told which roadmap is built.
 
     Raises:
@@ -102,21 +103,25 @@ def measure_roadmaps(
     for name in methods or ():
         if name not in METHODS:
             raise UnknownNameError("method", name, METHODS)
+    chosen = [method for method in METHODS if method in (methods or METHODS)]
     problems = chosen_problems(robots)
-    jobs = [(robot, task, method) for robot, task in problems for method in (methods or METHODS)]
     results: list[Result] = []
-    for index, (name, task, method) in enumerate(jobs):
-        progress(f"{name} {task}, {method}", index, len(jobs))
-        options: dict[str, Any] = {"seed": seed, "seeds": "auto" if method == "auto" else None}
-        if method == "random":
-            options |= {"method": "random", "samples": samples}
+    for index, (name, task) in enumerate(problems):
         robot = load_robot(name)
-        pairs: list[tuple[Roadmap, Roadmap]] = []
-        for _ in range(1 if method == "random" else repeats):
-            plain = build(robot, task, **options, refine=False, reachability=0 if pairs else reachability)
-            pairs.append((plain, refine(plain, seed=seed)))
-        for refined, roadmaps in enumerate(zip(*pairs, strict=True)):
-            seconds = statistics.median(roadmap.build_seconds for roadmap in roadmaps)
-            results.append(Result(name, task, method, bool(refined), seconds, roadmaps[0].quality()))
-    progress("done", len(jobs), len(jobs))
+        pairs: dict[str, list[tuple[Roadmap, Roadmap]]] = {method: [] for method in chosen}
+        for turn in range(repeats):
+            for method in chosen:
+                if turn and method == "random":
+                    continue
+                progress(f"{name} {task}, {method}, build {turn + 1} of {repeats}", index, len(problems))
+                options: dict[str, Any] = {"seed": seed, "seeds": "auto" if method == "auto" else None}
+                if method == "random":
+                    options |= {"method": "random", "samples": samples}
+                plain = build(robot, task, **options, refine=False, reachability=0 if turn else reachability)
+                pairs[method].append((plain, refine(plain, seed=seed)))
+        for method in chosen:
+            for refined, roadmaps in enumerate(zip(*pairs[method], strict=True)):
+                seconds = statistics.median(roadmap.build_seconds for roadmap in roadmaps)
+                results.append(Result(name, task, method, bool(refined), seconds, roadmaps[0].quality()))
+    progress("done", len(problems), len(problems))
     return results
