@@ -95,7 +95,9 @@ def much_nearer(follower: Follower, solver: Solver, points: Array, targets: Arra
     return distances < NEARER * task.gap_of_few(points, targets), vertices
 
 
-def solve_few(follower: Follower, solver: Solver, points: Array) -> tuple[Array, Mask, Array]:
+def solve_few(
+    follower: Follower, solver: Solver, points: Array, iterations: int = _ITERATIONS
+) -> tuple[Array, Mask, Array]:
     """Configurations (N, n) of the map at points (N, width), which are valid, and how far their guesses were off.
 
     `Solver.solve_from` for arrays.
@@ -105,7 +107,7 @@ def solve_few(follower: Follower, solver: Solver, points: Array) -> tuple[Array,
     )
     guesses, rows = guesses.astype(points.dtype), (codes <= LAST_VALID).nonzero()[0]
     q, strayed = np.full_like(guesses, np.nan), np.full(len(points), np.nan, points.dtype)
-    solved, valid = follower.solved(points[rows].T, guesses[rows].T, _ITERATIONS)
+    solved, valid = follower.solved(points[rows].T, guesses[rows].T, iterations)
     rows, solved = rows[valid], solved.T[valid]
     kept = solver.on_map(torch.from_numpy(solved), torch.from_numpy(guesses[rows])).numpy()
     rows, solved = rows[kept], solved[kept]
