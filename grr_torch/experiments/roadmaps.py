@@ -104,24 +104,23 @@ def measure_roadmaps(
         if name not in METHODS:
             raise UnknownNameError("method", name, METHODS)
     chosen = [method for method in METHODS if method in (methods or METHODS)]
+    # by turns; random only once
+    turns = [(turn, method) for turn in range(repeats) for method in chosen if method != "random" or turn == 0]
     problems = chosen_problems(robots)
     results: list[Result] = []
     for index, (name, task) in enumerate(problems):
         robot = load_robot(name)
         pairs: dict[str, list[tuple[Roadmap, Roadmap]]] = {method: [] for method in chosen}
-        for turn in range(repeats):
-            for method in chosen:
-                if turn and method == "random":
-                    continue
-                progress(f"{name} {task}, {method}, build {turn + 1} of {repeats}", index, len(problems))
-                options: dict[str, Any] = {"seed": seed, "seeds": "auto" if method == "auto" else None}
-                if method == "random":
-                    options |= {"method": "random", "samples": samples}
-                plain = build(robot, task, **options, refine=False, reachability=0 if turn else reachability)
-                pairs[method].append((plain, refine(plain, seed=seed)))
+        for number, (turn, method) in enumerate(turns):
+            progress(f"{name} {task}, {method}", index * len(turns) + number, len(problems) * len(turns))
+            options: dict[str, Any] = {"seed": seed, "seeds": "auto" if method == "auto" else None}
+            if method == "random":
+                options |= {"method": "random", "samples": samples}
+            plain = build(robot, task, **options, refine=False, reachability=0 if turn else reachability)
+            pairs[method].append((plain, refine(plain, seed=seed)))
         for method in chosen:
             for refined, roadmaps in enumerate(zip(*pairs[method], strict=True)):
                 seconds = statistics.median(roadmap.build_seconds for roadmap in roadmaps)
                 results.append(Result(name, task, method, bool(refined), seconds, roadmaps[0].quality()))
-    progress("done", len(problems), len(problems))
+    progress("done", len(problems) * len(turns), len(problems) * len(turns))
     return results

@@ -79,9 +79,8 @@ class TaskGraph:
         ranks = range(1, min(k + 1, len(self.points)) + 1)
         distances, indices = self._tree.query(self.points[vertices.cpu()].numpy(), k=ranks, workers=-1)
         # the vertex itself comes first: no two vertices coincide
-        return torch.from_numpy(indices[:, 1:]).to(vertices.device), torch.from_numpy(distances[:, 1:]).to(
-            vertices.device
-        )
+        found, apart = (torch.from_numpy(table[:, 1:]).to(vertices.device) for table in (indices, distances))
+        return found, apart
 
     def nearest(self, points: Tensor, k: int = 1) -> Tensor:
         """Indices (*batch, k) of the vertices nearest to each point (*batch, d), nearest first."""
