@@ -52,8 +52,9 @@ def project_few(robot: Robot, task: TaskSpace, tolerances: Tolerances, targets: 
         left = np.count_nonzero(kept)
         if left < len(kept):
             solved[:, rank[done]], valid[rank[done]] = now[:, done], True
-            if left == 0:
-                break
+        if left == 0 or iteration == tolerances.iterations:
+            break
+        if left < len(kept):
             rank, best, before, size, now = rank[kept], best[kept], before[kept], size[kept], now[:, kept]
             error, frames, targets = error[:, kept], frames[..., kept], targets[:, kept]
         jacobian = task.jacobian_of_few(few.jacobian(frames), targets)
