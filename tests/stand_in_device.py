@@ -2,26 +2,42 @@
 
 Its tensors say that they lie on "gpu:0". They compute as those on the CPU do, but an operation that mixes both fails as
 it would on a GPU. So code can be shown to keep its tensors where they belong, and to move few of them, without a GPU.
+
+Torch knows of it from the first time on that it is asked for, and until the process ends. It is for one thread. It
+needs a part of torch that is not of its stable interface; `AVAILABLE` says whether that is there.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+
+import grr_torch
+from grr_torch.spaces import lattice
+
+try:
+    from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
+
+    AVAILABLE = True
+except ImportError:
+    AVAILABLE = False
 
 NAME = "gpu"
 _aten = torch.ops.aten
 # indices may lie on the CPU; they are transferred
 _INDEXED = (_aten.index, _aten.index_put, _aten.index_put_, _aten._index_put_impl_)
-_PACKAGE = str(Path(__file__).parent.parent / "grr_torch")
+_PACKAGE = os.path.join(os.path.dirname(grr_torch.__file__), "")
+# besides those, these take numbers that are tensors of no dimension from the CPU, as pointwise operations do
+_TAKE_NUMBERS = (*_INDEXED, _aten.fill_, _aten.masked_fill, _aten.masked_fill_)
 
 
 class Moved(Tensor):
@@ -53,20 +69,14 @@ class Transfers:
 
     Attributes:
         moved: How often, by "to" or "from" the device and the place in the package that asked for it, "file.py:line".
-        sizes: Bytes, by the same.
-        read: How often single numbers were waited for (to branch on, or as the size of a result), by place.
     """
 
     def __init__(self) -> None:
         self.moved: Counter[tuple[str, str]] = Counter()
-        self.sizes: Counter[tuple[str, str]] = Counter()
-        self.read: Counter[str] = Counter()
 
-    def count(self, way: str, size: int) -> None:
-        """Counts a transfer of so many bytes "to" or "from" the device."""
-        key = (way, _place())
-        self.moved[key] += 1
-        self.sizes[key] += size
+    def count(self, way: str) -> None:
+        """Counts a transfer "to" or "from" the device."""
+        self.moved[way, _place()] += 1
 
     def within(self, *files: str) -> dict[tuple[str, str], int]:
         """Of `moved`, what these files of the package asked for."""
@@ -104,21 +114,21 @@ def _computed(function, args, kwargs):
     if name is _aten.copy_:
         target, source = args[:2]
         if isinstance(target, Moved) != isinstance(source, Moved):
-            _transfers.count("to" if isinstance(target, Moved) else "from", target.nbytes)
+            _transfers.count("to" if isinstance(target, Moved) else "from")
         _held(target).copy_(_held(source))
         return target
     given: list[Tensor] = []
     held = [_mapped(lambda value: given.append(value) or _held(value), part) for part in (args, *kwargs.values())]
     ours = [value for value in given if isinstance(value, Moved)]
-    # as on a GPU, numbers that are tensors of no dimension go along with the call
-    foreign = [value for value in given if not isinstance(value, Moved) and value.ndim > 0] if ours else ()
-    for value in foreign:
-        if name not in _INDEXED or not isinstance(args[0], Moved):
+    takes_numbers = torch.Tag.pointwise in function.tags or name in _TAKE_NUMBERS
+    indices = [id(index) for index in args[1]] if name in _INDEXED and isinstance(args[0], Moved) else ()
+    for value in given if ours else ():
+        if isinstance(value, Moved) or (value.ndim == 0 and takes_numbers):
+            continue
+        if id(value) not in indices:
             shapes = [tuple(one.shape) for one in ours]
             raise RuntimeError(f"{function}: of its tensors, {shapes} are on {NAME}, {tuple(value.shape)} is not")
-        _transfers.count("to", value.nbytes)
-    if ours and name in (_aten._local_scalar_dense, _aten.nonzero, _aten.equal, _aten._unique2, _aten.masked_select):
-        _transfers.read[_place()] += 1
+        _transfers.count("to")
     device = kwargs.get("device")
     named = dict(zip(kwargs, held[1:], strict=True))
     out = function(*held[0], **({**named, "device": "cpu"} if device else named))
@@ -140,7 +150,7 @@ def _copied(source: Tensor, *, device=None, pin_memory=None, **kwargs) -> Tensor
     out = _aten._to_copy(_held(source), **kwargs, device="cpu")
     there = isinstance(source, Moved) if device is None else _is_there(device)
     if there != isinstance(source, Moved):
-        _transfers.count("to" if there else "from", out.nbytes)
+        _transfers.count("to" if there else "from")
     return Moved(out) if there else out
 
 
@@ -158,7 +168,7 @@ def _from_lists(library: torch.library.Library) -> None:
         return Moved(torch.empty_strided(size, stride, dtype=dtype))
 
     def copy_from(source, target, non_blocking=False):
-        _transfers.count("to", source.nbytes)
+        _transfers.count("to")
         target.held.copy_(source)
         return target
 
@@ -166,15 +176,21 @@ def _from_lists(library: torch.library.Library) -> None:
     library.impl("_copy_from", copy_from, "PrivateUse1")
 
 
-_setup_privateuseone_for_python_backend(NAME)
-_library = torch.library.Library("aten", "IMPL")
-_from_lists(_library)
+@cache
+def _registered() -> torch.library.Library:
+    _setup_privateuseone_for_python_backend(NAME)
+    library = torch.library.Library("aten", "IMPL")
+    _from_lists(library)
+    return library
 
 
 @contextmanager
 def stand_in() -> Iterator[Transfers]:
     """Within it there is a device `NAME`; tells what is moved."""
     global _transfers
+    _registered()
     _transfers = Transfers()
+    # what goes to a device once would count in one test and not in the next
+    lattice._stencil.cache_clear()
     with _NewTensors():
         yield _transfers

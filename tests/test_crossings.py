@@ -148,7 +148,7 @@ def test_targets_are_met_where_the_map_solves_their_way_from_then_on(
 
 
 @pytest.mark.parametrize("degrees", [20, 30])
-def test_a_place_to_meet_is_given_up_when_the_target_goes_past_it(roadmap, through_holes, degrees):
+def test_a_place_to_meet_is_given_up_when_the_target_bends_away_from_it(roadmap, through_holes, degrees):
     """Targets that bend in the hole, too little to have turned."""
     bend, steps = 100, np.arange(60)[:, None, None]
     way = (through_holes[1] - through_holes[0]).numpy()

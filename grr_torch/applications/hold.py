@@ -100,7 +100,7 @@ def solve_few(
 ) -> tuple[Array, Mask, Array]:
     """Configurations (N, n) of the map at points (N, width), which are valid, and how far their guesses were off.
 
-    `Solver.solve_from` for arrays.
+    `Solver.solve_from` for arrays, in at most so many `iterations`: what takes more is not valid.
     """
     guesses, codes = (
         part.numpy() for part in solver.guess(torch.from_numpy(points.astype(np.float64)), certified=False)

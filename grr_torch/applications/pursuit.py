@@ -37,9 +37,10 @@ _ASIDE, _TOO_LATE = 0.05, 0.6
 _AS_LONG = 1.5
 # what is not so far [s] is come to along the edge of reach
 _FAR = 0.4
-# points from where a target seems to come out of a hole on that are solved, to see from where it can be followed: where
-# two on end are
-_SOLVED, _ITERATIONS = 14, 3
+# so many points from where a target seems to come out of a hole on are solved, in at most so many iterations: it can be
+# followed from the first of two successive ones on that the map solves. That leaves out one in thirty that it solves,
+# most beside the hole
+_SOLVED, _LOOK_ITERATIONS = 14, 3
 # an arm one of whose joints has to make about half a turn [rad], as for a target that goes through the base axis, meets
 # it so much later [s]: the way round is shorter there
 _HALF_TURN, _LATER = 2.95, 0.28
@@ -205,7 +206,9 @@ class Pursuit:
         rows, steps = np.arange(len(q)), self._ahead
         index = np.clip(out[:, None] + np.arange(-1, _SOLVED - 1), 0, len(steps) - 1)
         looked, times = points[rows[:, None], index], steps[index]
-        solved, solvable, _ = solve_few(self.follower, self.solver, looked.reshape(-1, points.shape[2]), _ITERATIONS)
+        solved, solvable, _ = solve_few(
+            self.follower, self.solver, looked.reshape(-1, points.shape[2]), _LOOK_ITERATIONS
+        )
         ways, valid = solved.reshape(*index.shape, -1), solvable.reshape(index.shape)
         valid &= known[rows[:, None], index]
         followed = valid[:, :-1] & valid[:, 1:] & (np.diff(times, axis=1) > 0.0)
