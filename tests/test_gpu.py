@@ -133,17 +133,15 @@ def test_a_projection_moves_nothing(generator):
 
 @without_cuda
 @pytest.mark.parametrize(
-    ("task", "sizes"),
-    [("fixed-rotation", ({"points": 200}, {"points": 1200})), ("pose", ({"points": 40}, {"points": 90}))],
+    ("task", "sizes", "options"),
+    [("fixed-rotation", (200, 1200), {}), ("pose", (40, 90), {"rotations": 3, "refine": False})],
 )
-def test_a_build_moves_no_more_often_with_more_vertices(task, sizes):
+def test_a_build_moves_no_more_often_with_more_vertices(task, sizes, options):
     """But for rounds of repair: waves of an expansion and rounds of a relaxation move nothing."""
     often = []
-    for size in sizes:
-        if task == "pose":
-            size = {**size, "rotations": 3}
+    for points in sizes:
         with stand_in_device.stand_in() as transfers:
-            grr_torch.build(grr_torch.load_robot("planar_5", device=STAND_IN), task, **size)
+            grr_torch.build(grr_torch.load_robot("planar_5", device=STAND_IN), task, points=points, **options)
         assert not transfers.within("step.py", "continuity.py", "columns.py", "relax.py", "hops.py", "certify.py")
         # a stencil or a ring goes there once
         assert not transfers.within("lattice.py", "task.py", "turning.py")
