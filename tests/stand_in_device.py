@@ -3,7 +3,7 @@
 Its tensors say that they lie on "gpu:0". They compute as those on the CPU do, but an operation that mixes both fails as
 it would on a GPU. So code can be shown to keep its tensors where they belong, and to move few of them, without a GPU.
 
-Torch knows of it from the first time on that it is asked for, and until the process ends. It is for one thread. It
+Torch knows of it from import on, and until the process ends. It is for one thread. It
 needs a part of torch that is not of its stable interface; `AVAILABLE` says whether that is there.
 """
 
@@ -14,7 +14,6 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -176,19 +175,17 @@ def _from_lists(library: torch.library.Library) -> None:
     library.impl("_copy_from", copy_from, "PrivateUse1")
 
 
-@cache
-def _registered() -> torch.library.Library:
+# before the first tensor is differentiated: from then on, torch's engine knows no more devices
+if AVAILABLE and not torch.cuda.is_available():
     _setup_privateuseone_for_python_backend(NAME)
-    library = torch.library.Library("aten", "IMPL")
-    _from_lists(library)
-    return library
+    _library = torch.library.Library("aten", "IMPL")
+    _from_lists(_library)
 
 
 @contextmanager
 def stand_in() -> Iterator[Transfers]:
     """Within it there is a device `NAME`; tells what is moved."""
     global _transfers
-    _registered()
     _transfers = Transfers()
     # what goes to a device once would count in one test and not in the next
     lattice._stencil.cache_clear()
