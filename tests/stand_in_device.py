@@ -3,8 +3,8 @@
 Its tensors say that they lie on "gpu:0". They compute as those on the CPU do, but an operation that mixes both fails as
 it would on a GPU. So code can be shown to keep its tensors where they belong, and to move few of them, without a GPU.
 
-Torch knows of it from import on, and until the process ends. It is for one thread. It
-needs a part of torch that is not of its stable interface; `AVAILABLE` says whether that is there.
+Torch knows of it from import on, and until the process ends. It is for one thread, and not for beside a real GPU. It
+needs a part of torch that is not of its stable interface. `AVAILABLE` says whether it is there.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from grr_torch.spaces import lattice
 try:
     from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
-    AVAILABLE = True
+    AVAILABLE = not torch.cuda.is_available()
 except ImportError:
     AVAILABLE = False
 
@@ -176,7 +176,7 @@ def _from_lists(library: torch.library.Library) -> None:
 
 
 # before the first tensor is differentiated: from then on, torch's engine knows no more devices
-if AVAILABLE and not torch.cuda.is_available():
+if AVAILABLE:
     _setup_privateuseone_for_python_backend(NAME)
     _library = torch.library.Library("aten", "IMPL")
     _from_lists(_library)
