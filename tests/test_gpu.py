@@ -132,16 +132,19 @@ def test_a_projection_moves_nothing(generator):
     [("fixed-rotation", (200, 1200), {}), ("pose", (40, 90), {"rotations": 3, "refine": False})],
 )
 def test_a_build_moves_no_more_often_with_more_vertices(task, sizes, options):
-    """But for rounds of repair: waves of an expansion and rounds of a relaxation move nothing."""
-    often = []
+    """Waves of an expansion, rounds of a repair and of a relaxation move nothing, but for random starts."""
+    often, repairs = [], []
     for points in sizes:
         with stand_in_device.stand_in() as transfers:
             grr_torch.build(grr_torch.load_robot("planar_5", device=STAND_IN), task, points=points, **options)
         assert not transfers.within("step.py", "continuity.py", "columns.py", "relax.py", "hops.py", "certify.py")
         # a stencil or a ring goes there once
         assert not transfers.within("lattice.py", "task.py", "turning.py")
+        assert all(way == "to" for way, _ in transfers.within("repair_candidates.py"))
         often.append(sum(transfers.within("expand.py", "graph.py", "product.py", "devices.py").values()))
+        repairs.append(sum(transfers.within("repair.py").values()))
     assert often[0] == often[1] > 0
+    assert repairs[0] == repairs[1] == (0 if "refine" in options else 12)
 
 
 @needs_cuda

@@ -11,7 +11,8 @@ import torch
 import grr_torch
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution import auto_seeds
-from grr_torch.resolution.repair import _Candidates, _choose, _resolved_around, _Trial
+from grr_torch.resolution.repair import _choose, _Trial
+from grr_torch.resolution.repair_candidates import Candidates, Draft, Setting
 from grr_torch.resolution.slopes import edge_slopes
 
 
@@ -31,7 +32,7 @@ def with_broken_edge(roadmap: grr_torch.Roadmap, vertex: int, bound: float | Non
 
 def trial_of(roadmap: grr_torch.Roadmap, vertices: torch.Tensor, steepness: list[float]) -> _Trial:
     """All edges of candidates join, and each is so many times as steep as the vertex's own."""
-    rank, ends = _resolved_around(roadmap, vertices, roadmap.graph)
+    rank, ends = roadmap.graph.around(vertices)
     edges = roadmap.graph.edge_between(vertices[rank], ends)
     slopes = edge_slopes(roadmap, edges) * torch.tensor(steepness, dtype=torch.float64)[rank]
     return _Trial(rank, edges, slopes, torch.ones_like(rank, dtype=torch.bool))
@@ -40,12 +41,13 @@ def trial_of(roadmap: grr_torch.Roadmap, vertices: torch.Tensor, steepness: list
 def chosen(
     roadmap: grr_torch.Roadmap, vertices: list[int], steepness: list[float], lost: int | None = None
 ) -> list[int]:
-    candidates = _Candidates(torch.tensor(vertices), roadmap.configurations[vertices])
+    candidates = Candidates(torch.tensor(vertices), roadmap.configurations[vertices])
     trial = trial_of(roadmap, candidates.vertices, steepness)
     if lost is not None:
         keeps = roadmap.connected[trial.edges] & (trial.rank == lost)
         trial.joined[keeps.nonzero()[0]] = False
-    return _choose(roadmap, candidates, trial).tolist()
+    draft = Draft(roadmap.configurations, roadmap.connected, roadmap.wave)
+    return _choose(draft, candidates, trial, Setting.of(roadmap, Tolerances(), 0, at_last=False)).tolist()
 
 
 def test_an_edge_is_worth_as_much_as_the_bound_that_it_is_left_out_by(whole):

@@ -12,7 +12,9 @@ from torch import Tensor
 
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.edges import check_edges
+from grr_torch.robots.robot import Robot
 from grr_torch.spaces.configuration import distance
+from grr_torch.spaces.task import TaskSpace
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -30,6 +32,17 @@ def edge_slopes(roadmap: Roadmap, edges: Tensor | None = None) -> Tensor:
     Where D_q and D_p are distances of joint and of task space (Section IV-B of the paper).
     """
     return _slopes(roadmap, roadmap.edges[roadmap.connected if edges is None else edges])
+
+
+def slopes_along(robot: Robot, task: TaskSpace, points: Tensor, configurations: Tensor, edges: Tensor) -> Tensor:
+    """D_q / D_p (E,) along edges (E, 2) between points (V, width) with configurations (V, n), on their device.
+
+    In double precision, as in files, whatever the robot computes in.
+    """
+    first, second = edges.T
+    wraps = robot.continuous.to(edges.device)
+    moved = distance(configurations[first].double(), configurations[second].double(), wraps)
+    return moved / task.distance(points[first], points[second])
 
 
 def steep_edges(roadmap: Roadmap, max_slope: float | None = None) -> Tensor:
@@ -128,8 +141,4 @@ def with_raised_bound(roadmap: Roadmap) -> Roadmap:
 
 
 def _slopes(roadmap: Roadmap, edges: Tensor) -> Tensor:
-    first, second = edges.T
-    q, points = roadmap.configurations, roadmap.points
-    # in double precision, as in files, whatever the robot computes in
-    moved = distance(q[first].double(), q[second].double(), roadmap.robot.continuous.cpu())
-    return moved / roadmap.task.distance(points[first], points[second])
+    return slopes_along(roadmap.robot, roadmap.task, roadmap.points, roadmap.configurations, edges)

@@ -127,7 +127,7 @@ class TaskGraph:
         Raises:
             ParameterError: Two of them are not joined.
         """
-        keys, order = self._sorted_keys
+        keys, order = self._sorted_keys.at(first.device)
         pairs = torch.stack([first, second], dim=1).sort(dim=1).values
         wanted = pairs[:, 0] * len(self.points) + pairs[:, 1]
         places = torch.searchsorted(keys, wanted)
@@ -138,8 +138,8 @@ class TaskGraph:
         return order[places]
 
     @cached_property
-    def _sorted_keys(self) -> tuple[Tensor, Tensor]:
-        return (self.edges[:, 0] * len(self.points) + self.edges[:, 1]).sort()
+    def _sorted_keys(self) -> OnDevices:
+        return OnDevices(*(self.edges[:, 0] * len(self.points) + self.edges[:, 1]).sort())
 
 
 @dataclass(frozen=True, eq=False)
