@@ -11,7 +11,7 @@ import grr_torch
 from grr_torch import Teleoperator
 from grr_torch.applications.arms import Arms
 from grr_torch.applications.lines import Follower
-from grr_torch.applications.pursuit import Pursuit
+from grr_torch.applications.pursuit import _TOO_LATE, Pursuit
 from grr_torch.applications.routes import Routes
 from grr_torch.experiments.paths import draw_paths
 from grr_torch.experiments.teleoperation import starts
@@ -150,6 +150,34 @@ def test_what_counts_as_open_is_mostly_what_can_be_solved(roadmap, through_holes
     assert (open_ & ~solvable).mean() < 0.15
     assert (solvable & ~open_).mean() < 0.03
     assert (np.isfinite(needs) == open_).all()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "there", "kept"),
+    [
+        (-0.2, False, True),
+        (0.9 * _TOO_LATE, False, True),
+        (1.1 * _TOO_LATE, False, False),
+        (-0.2, True, True),
+        (0.2, True, False),
+    ],
+)
+def test_a_place_is_kept_until_its_target_has_long_come_past_it_or_the_arm_is_there(roadmap, seconds, there, kept):
+    """The target has come past it so many seconds ago; before that, an arm that is there waits."""
+    rate, motion = 50.0, torch.tensor([[4e-3, 2e-3, 0.0]], dtype=torch.float64)
+    q = roadmap.configurations[some_vertices(roadmap, 2)]
+    tools = roadmap.robot.forward_kinematics(q)[0]
+    follower = Follower(roadmap.robot, roadmap.task, DEFAULT_TOLERANCES, torch.full((7,), STEP, dtype=torch.float64))
+    arms = Arms.at(follower, q[:1].numpy().copy())
+    place = tools[:1] if there else tools[1:]
+    assert float((tools[0] - tools[1]).norm()) > 0.05
+    arms.meeting.place[:], arms.meeting.velocity[:], arms.meeting.across[:] = place.numpy(), motion.numpy(), True
+    pursuit = Pursuit(follower, roadmap.solver, rate, 2.0)
+    target = (place + seconds * rate * motion).numpy()
+    assert pursuit._goes_on(arms, np.arange(1), target).tolist() == [kept]
+    # a target that comes past it at a distance has turned away
+    aside = np.array([[0.0, 0.0, 0.2]])
+    assert pursuit._goes_on(arms, np.arange(1), target + aside).tolist() == [False]
 
 
 @pytest.mark.parametrize("rate", [25.0, 100.0])
