@@ -23,8 +23,8 @@ from grr_torch.resolution.edges import continuous_pairs
 from grr_torch.resolution.expand import default_neighbours, grow
 from grr_torch.resolution.relax import Network, relax
 from grr_torch.resolution.seeds import in_the_middle
+from grr_torch.resolution.slopes import slopes_between
 from grr_torch.robots.robot import Robot
-from grr_torch.spaces.configuration import distance
 from grr_torch.spaces.graph import Copies, TaskGraph, staggered_grid
 from grr_torch.spaces.product import ProductGraph, product_graph
 from grr_torch.spaces.task import TaskSpace
@@ -196,8 +196,8 @@ def _sums(slopes: Tensor) -> Tensor:
 def _slopes(robot: Robot, task: TaskSpace, graph: TaskGraph, maps: Tensor) -> Tensor:
     """(C, E) D_q / D_p of all edges, of maps (C, V, n); NaN where an end is unresolved."""
     first, second = graph.edges.to(maps.device).unbind(1)
-    points = graph.points.to(maps)
-    return distance(maps[:, first], maps[:, second], robot.continuous) / task.distance(points[first], points[second])
+    points = graph.points.to(maps.device)
+    return slopes_between(robot, task, points[first], points[second], maps[:, first], maps[:, second])
 
 
 def _broken(

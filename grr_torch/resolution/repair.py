@@ -16,8 +16,7 @@ from grr_torch.resolution.edges import EdgeCheck, continuous_pairs
 from grr_torch.resolution.losses import FlagCheck, is_large, moved, without_losses
 from grr_torch.resolution.repair_candidates import Candidates, Draft, Setting, find_candidates, sums
 from grr_torch.resolution.roadmap import Roadmap
-from grr_torch.resolution.slopes import slopes_along
-from grr_torch.spaces.configuration import distance
+from grr_torch.resolution.slopes import slopes_between
 
 # random starts of a vertex
 _STARTS = 8
@@ -145,7 +144,7 @@ def _try(draft: Draft, candidates: Candidates, setting: Setting) -> _Trial:
     vertices = candidates.vertices[rank]
     configurations = candidates.configurations[rank], draft.configurations[ends]
     points = setting.points[vertices], setting.points[ends]
-    slopes = distance(*configurations, robot.continuous) / task.distance(*points)
+    slopes = slopes_between(robot, task, *points, *configurations)
     worth = slopes <= setting.max_slope
     joined = torch.zeros_like(worth)
     pairs = (part[worth] for part in (*points, *configurations))
@@ -161,8 +160,9 @@ def _choose(draft: Draft, candidates: Candidates, trial: _Trial, setting: Settin
     """
     vertices, count = candidates.vertices, len(candidates.vertices)
     connected = draft.connected[trial.edges]
-    ends = setting.edges[trial.edges]
-    own = slopes_along(setting.robot, setting.task, setting.points, draft.configurations, ends)
+    first, second = setting.edges[trial.edges].T
+    q, points = draft.configurations, setting.points
+    own = slopes_between(setting.robot, setting.task, points[first], points[second], q[first], q[second])
     own = torch.where(connected, own, 0.0)
     charge = setting.bound or 1.0 + float(trial.slopes.sum() + own.sum())
     costs = sums(count, trial.rank, torch.where(trial.joined, trial.slopes, charge))

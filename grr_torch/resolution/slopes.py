@@ -34,15 +34,16 @@ def edge_slopes(roadmap: Roadmap, edges: Tensor | None = None) -> Tensor:
     return _slopes(roadmap, roadmap.edges[roadmap.connected if edges is None else edges])
 
 
-def slopes_along(robot: Robot, task: TaskSpace, points: Tensor, configurations: Tensor, edges: Tensor) -> Tensor:
-    """D_q / D_p (E,) along edges (E, 2) between points (V, width) with configurations (V, n), on their device.
+def slopes_between(
+    robot: Robot, task: TaskSpace, points: Tensor, others: Tensor, configurations: Tensor, other_configurations: Tensor
+) -> Tensor:
+    """D_q / D_p (…) between configurations (…, n) at points (…, width) and others, on any device.
 
     In double precision, as in files, whatever the robot computes in.
     """
-    first, second = edges.T
-    wraps = robot.continuous.to(edges.device)
-    moved = distance(configurations[first].double(), configurations[second].double(), wraps)
-    return moved / task.distance(points[first], points[second])
+    wraps = robot.continuous.to(configurations.device)
+    moved = distance(configurations.double(), other_configurations.double(), wraps)
+    return moved / task.distance(points, others)
 
 
 def steep_edges(roadmap: Roadmap, max_slope: float | None = None) -> Tensor:
@@ -141,4 +142,6 @@ def with_raised_bound(roadmap: Roadmap) -> Roadmap:
 
 
 def _slopes(roadmap: Roadmap, edges: Tensor) -> Tensor:
-    return slopes_along(roadmap.robot, roadmap.task, roadmap.points, roadmap.configurations, edges)
+    first, second = edges.T
+    q, points = roadmap.configurations, roadmap.points
+    return slopes_between(roadmap.robot, roadmap.task, points[first], points[second], q[first], q[second])
