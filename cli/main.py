@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -80,6 +81,8 @@ def run(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: What follows the program's name; by default what the process was given.
     """
+    # asked to end, it ends as by Ctrl-C: nothing is left half written
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     app(join_numbers(list(sys.argv[1:] if arguments is None else arguments)), prog_name="grr-torch")
 
 

@@ -33,7 +33,8 @@ def plan(
     smooth: Annotated[bool, typer.Option("--smooth", help="Shorten the path by straight lines on the map.")] = False,
     step: Annotated[float, typer.Option(help="Distance that neighbouring waypoints stay below, in radians.")] = 0.05,
     velocity: Annotated[
-        float | None, typer.Option(help="Velocity limit of all joints, in rad/s or m/s; the robot's.")
+        float | None,
+        typer.Option(help="Velocity limit of all joints, in rad/s or m/s; the robot's, or 1."),
     ] = None,
     acceleration: Annotated[
         float | None, typer.Option(help="Acceleration limit of all joints, in rad/s² or m/s²; none.")

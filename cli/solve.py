@@ -70,8 +70,8 @@ def solve(
     if out is not None:
         with progress_bar() as progress:
             # read twice: what is wrong with the file is said before the work starts
-            count = len(places) if points is None else sum(map(len, read_points(points, width, axes)))
-            pieces = [places] if points is None else read_points(points, width, axes)
+            count = len(places) if points is None else sum(map(len, read_points(points, axes)))
+            pieces = [places] if points is None else read_points(points, axes)
             counts = solve_table(roadmap, pieces, count, out, progress=progress)
     _show(roadmap, places, counts, out, as_json)
 

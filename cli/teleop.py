@@ -101,10 +101,8 @@ def _replay(teleoperator: Teleoperator, path: str) -> TeleoperationLog:
     if path not in KINDS and not Path(path).suffix and not Path(path).exists():
         raise UnknownNameError("path", path, KINDS, " Or the name of a file of waypoints.")
     roadmap = teleoperator.roadmap
-    if path in KINDS:
-        waypoints = example_path(roadmap, path, teleoperator.rate)
-    else:
-        waypoints = read_waypoints(path, roadmap.task.width)
+    example = path in KINDS
+    waypoints = example_path(roadmap, path, teleoperator.rate) if example else read_waypoints(path, roadmap.task)
     with progress_bar() as progress:
         return replay(teleoperator, waypoints, progress=progress)
 

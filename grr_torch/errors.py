@@ -132,6 +132,22 @@ def check_seed(seed: int) -> int:
     return check_whole("seed", seed, 0, (1 << 63) - 1)
 
 
+def check_kind(name: str, value: object, kind: type, origin: str) -> None:
+    """Finds out whether a parameter is of the class that it should be.
+
+    Args:
+        name: The parameter's.
+        value: What was given.
+        kind: The class.
+        origin: What gives one.
+
+    Raises:
+        ParameterError: It is not.
+    """
+    if not isinstance(value, kind):
+        raise ParameterError(name, repr(value), f"a {kind.__name__}, such as {origin} gives")
+
+
 class SeedError(GrrError):
     """Seeds of which none can start a roadmap.
 

@@ -41,20 +41,19 @@ def check_suffix(name: str, path: Path, *, read: bool = False) -> None:
         raise ParameterError(name, path, f"a file that ends in {', '.join(known)}")
 
 
-def read_points(path: Path, width: int, axes: Sequence[str] = AXES) -> Iterator[Array]:
+def read_points(path: Path, axes: Sequence[str]) -> Iterator[Array]:
     """Points of a file in pieces (N, width); see `read_rows`.
 
     Args:
         path: The file.
-        width: How many coordinates a point has.
-        axes: Their names.
+        axes: Names of a point's coordinates.
 
     Raises:
         ParameterError: The suffix is not known.
         FileFormatError: As `read_rows` has it.
     """
     check_suffix("points", path, read=True)
-    yield from read_rows(path, axes[:width], "points")
+    yield from read_rows(path, axes, "points")
 
 
 def read_rows(path: Path, names: Sequence[str] | None, what: str) -> Iterator[Array]:

@@ -149,7 +149,9 @@ def test_unusable_seeds_are_named_and_the_build_goes_on(kinova, generator):
     good = grr_torch.load_preset("kinova").problems["position"].seeds
     q = kinova.sample(5000, generator)
     colliding = q[kinova.self_collision_distance(q) < -0.01][0]
-    beyond = torch.tensor([0.0, 3.0, 0, 0, 0, 0, 0])
+    # in self-collision too: the limits are what is wrong
+    beyond = colliding + torch.tensor([0.0, 4.0 * math.pi, 0, 0, 0, 0, 0])
+    assert bool(kinova.in_self_collision(beyond))
     seeds = torch.stack([torch.tensor(good[0]), colliding, beyond, torch.tensor(good[1])])
     wanted = "2 of 4 seeds are not used: seed 1: in self-collision; seed 2: outside joint limits"
     with pytest.warns(GrrWarning, match=wanted):

@@ -21,6 +21,8 @@ from grr_torch.learning.neural_ik import NeuralIK
 from grr_torch.learning.onnx import export_torch
 from grr_torch.learning.options import TrainingOptions
 from grr_torch.learning.train import train_ik
+from grr_torch.projection.project import Tolerances
+from grr_torch.resolution import repair
 from grr_torch.resolution.verify import verify_file
 from grr_torch.spaces.configuration import difference
 from grr_torch.spaces.task import FixedRotation
@@ -131,20 +133,37 @@ def test_a_projection_moves_nothing(generator):
     ("task", "sizes", "options"),
     [("fixed-rotation", (200, 1200), {}), ("pose", (40, 90), {"rotations": 3, "refine": False})],
 )
-def test_a_build_moves_no_more_often_with_more_vertices(task, sizes, options):
-    """Waves of an expansion, rounds of a repair and of a relaxation move nothing, but for random starts."""
-    often, repairs = [], []
+def test_expansion_and_relaxation_move_no_more_often_with_more_vertices(task, sizes, options):
+    often = []
     for points in sizes:
         with stand_in_device.stand_in() as transfers:
             grr_torch.build(grr_torch.load_robot("planar_5", device=STAND_IN), task, points=points, **options)
         assert not transfers.within("step.py", "continuity.py", "columns.py", "relax.py", "hops.py", "certify.py")
         # a stencil or a ring goes there once
         assert not transfers.within("lattice.py", "task.py", "turning.py")
-        assert all(way == "to" for way, _ in transfers.within("repair_candidates.py"))
         often.append(sum(transfers.within("expand.py", "graph.py", "product.py", "devices.py").values()))
-        repairs.append(sum(transfers.within("repair.py").values()))
     assert often[0] == often[1] > 0
-    assert repairs[0] == repairs[1] == (0 if "refine" in options else 12)
+
+
+@without_cuda
+@pytest.mark.parametrize("points", [40, 90])
+def test_rounds_of_a_repair_move_nothing_but_random_starts(points, monkeypatch):
+    rounds, find = [], repair.find_candidates
+    monkeypatch.setattr(repair, "find_candidates", lambda *given: rounds.append(1) or find(*given))
+    with stand_in_device.stand_in() as transfers:
+        arm = grr_torch.load_robot("planar_5", device=STAND_IN)
+        plain = grr_torch.build(arm, "pose", points=points, rotations=3, refine=False)
+        transfers.moved.clear()
+        repaired = repair.repair(plain, Tolerances(), 0)
+    assert int(repaired.connected.sum()) > int(plain.connected.sum())
+    assert len(rounds) > 3
+    # points, edges and what is within reach, and what is beside configurations
+    assert {way for way, _ in transfers.within("repair_candidates.py")} == {"to"}
+    assert sum(transfers.within("repair_candidates.py").values()) == 3 + len(rounds)
+    # configurations, flags and waves, there and back
+    assert sum(transfers.within("repair.py").values()) == 6
+    # which joints turn without limits, for the slopes on the CPU that say how steep edges may be
+    assert sum(transfers.within("slopes.py").values()) == 1
 
 
 @needs_cuda

@@ -180,6 +180,16 @@ def test_weights_of_another_robot_or_roadmap_are_refused(planar_roadmap, trained
     other = replace(planar_roadmap, configurations=planar_roadmap.configurations + 0.1)
     with pytest.raises(ParameterError, match="trained on"):
         evaluate_ik(trained, other)
+    with pytest.raises(ParameterError, match="dataset: got one of roadmap .*; valid: of this one"):
+        train_ik(planar_roadmap, SMALL, dataset=RoadmapDataset(other))
+
+
+def test_what_is_no_roadmap_or_no_options_is_refused(planar_roadmap):
+    for call in (RoadmapDataset, train_ik):
+        with pytest.raises(ParameterError, match="roadmap: got 'planar.grr'; valid: a Roadmap"):
+            call("planar.grr")
+    with pytest.raises(ParameterError, match="valid: a TrainingOptions"):
+        train_ik(planar_roadmap, {"epochs": 2})
 
 
 def test_damaged_weights_are_refused(planar_roadmap, trained, tmp_path):
@@ -240,6 +250,8 @@ def test_values_outside_their_range_are_refused(planar_roadmap, trained):
         TrainingOptions(joint_weight=0.0, pose_weight=0.0)
     with pytest.raises(UnknownNameError):
         Split("blocks")
+    with pytest.raises(ParameterError, match="block: got 0.1; valid: none for a split that is random"):
+        Split("random", block=0.1)
     with pytest.raises(ParameterError, match="blocks"):
         Split(block=1e-6).of(planar_roadmap)
     with pytest.raises(ParameterError, match="none is for"):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 import torch
+from command_line import PROGRAM
 from safetensors.numpy import load_file
 
 import grr_torch
@@ -130,6 +133,21 @@ def test_an_export_that_is_stopped_leaves_nothing(planar_roadmap, tmp_path, suff
     with pytest.raises(error):
         export_dataset(planar_roadmap, out, ROWS, progress=stop)
     assert out.read_bytes() == b"before"
+
+
+def test_an_export_that_is_asked_to_end_leaves_nothing(planar_roadmap, tmp_path):
+    planar_roadmap.save(tmp_path / "map.grr")
+    words = ["export", tmp_path / "map.grr", "--samples", "3000000", "--out", tmp_path / "d.npz"]
+    process = subprocess.Popen([*PROGRAM, *map(str, words)], stderr=subprocess.DEVNULL)
+    try:
+        while not list(tmp_path.glob(".d.npz*")):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.terminate()
+        assert process.wait(60) != 0
+    finally:
+        process.kill()
+    assert [path.name for path in tmp_path.iterdir()] == ["map.grr"]
 
 
 def test_pandas_opens_parquet_as_it_is(planar_roadmap, tmp_path):

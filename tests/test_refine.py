@@ -72,10 +72,13 @@ def test_the_same_map_is_refined_to_the_same_bytes(kinova):
         assert getattr(first, name).numpy().tobytes() == getattr(second, name).numpy().tobytes()
 
 
-def test_what_was_taken_away_is_repaired(planar_5):
+@pytest.mark.parametrize("every", [25, 3])
+def test_what_was_taken_away_is_repaired(planar_5, every):
+    """Neighbours too."""
     whole = grr_torch.build(planar_5, "position", points=400, refine=False)
     inner = (whole.points.norm(dim=1) < 0.35).nonzero()[:, 0]
-    taken = inner[::25]
+    taken = inner[::every]
+    assert bool(torch.isin(whole.edges, taken).all(1).any()) == (every == 3)
     configurations, resolved = whole.configurations.clone(), whole.resolved.clone()
     configurations[taken], resolved[taken] = math.nan, False
     connected = whole.connected & ~torch.isin(whole.edges, taken).any(1)
@@ -83,6 +86,15 @@ def test_what_was_taken_away_is_repaired(planar_5):
     mended = refine(damaged)
     assert bool(mended.resolved[taken].all())
     assert int(mended.connected.sum()) >= int(whole.connected.sum())
+
+
+def test_a_roadmap_from_a_file_is_repaired_in_single_precision(tmp_path):
+    robot = grr_torch.load_robot("planar_5", dtype=torch.float32)
+    grr_torch.build(robot, "fixed-rotation", points=200, refine=False).save(tmp_path / "f.grr")
+    plain = grr_torch.Roadmap.load(tmp_path / "f.grr")
+    assert plain.configurations.dtype == torch.float64
+    mended = refine(plain)
+    assert int(mended.connected.sum()) > int(plain.connected.sum())
 
 
 def test_the_null_space_projector_keeps_what_leaves_the_task_alone(generator):

@@ -1,4 +1,4 @@
-"""Which candidates a repair takes, by what their edges would cost."""
+"""Which candidates a repair takes, by what their edges would cost, and how it goes on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 import grr_torch
 from grr_torch.projection.project import Tolerances
-from grr_torch.resolution import auto_seeds
+from grr_torch.resolution import auto_seeds, checkpoint
 from grr_torch.resolution.repair import _choose, _Trial
 from grr_torch.resolution.repair_candidates import Candidates, Draft, Setting
 from grr_torch.resolution.slopes import edge_slopes
@@ -86,3 +86,23 @@ def test_found_seeds_are_relaxed_within_the_bound_that_a_build_has(kinova, monke
     # on the coarse graph, of each finalist, and of the best of them
     finalists = math.ceil(40 * auto_seeds._FINALISTS)
     assert bounds == [None, *[max_slope] * finalists, max_slope]
+
+
+@pytest.mark.parametrize("turn", [1, 2, 3])
+def test_interrupted_between_rounds_it_ends_with_the_same_tensors(planar_5, tmp_path, monkeypatch, turn):
+    monkeypatch.setattr(checkpoint, "_INTERVAL", 0.0)
+    monkeypatch.setattr(checkpoint, "_PATIENCE", 0.0)
+    options = {"task": "pose", "points": 90, "rotations": 3, "seed": 1}
+    undisturbed = grr_torch.build(planar_5, **options)
+    rounds = []
+
+    def stop(stage, done, total):
+        rounds.extend([done] * (stage == "repairing" and 0 < done < total))
+        if len(rounds) == turn:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        grr_torch.build(planar_5, **options, checkpoint=tmp_path, progress=stop)
+    resumed = grr_torch.build(planar_5, **options, checkpoint=tmp_path, resume=True)
+    for name in ("configurations", "connected", "wave"):
+        assert torch.equal(getattr(resumed, name).nan_to_num(9.9), getattr(undisturbed, name).nan_to_num(9.9))

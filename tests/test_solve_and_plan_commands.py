@@ -227,7 +227,7 @@ def test_a_path_is_written_as_it_was_planned(planar_roadmap, tmp_path, suffix):
             found = np.column_stack([file["times"], file["points"], file["configurations"]])
             np.testing.assert_array_equal(file["vertices"], path.vertices)
     else:
-        found = np.concatenate(list(read_points(tmp_path / f"p{suffix}", 2)))
+        found = np.concatenate(list(read_points(tmp_path / f"p{suffix}", ("x", "y"))))
         expected = expected[:, 1:3]
     np.testing.assert_array_equal(found, expected)
 

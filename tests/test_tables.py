@@ -34,7 +34,7 @@ from grr_torch.tensor_file import stream_tensors
 )
 def test_csv_files_are_read_as_people_write_them(tmp_path, text):
     (tmp_path / "p.csv").write_text(text, encoding="utf-8", newline="")
-    (piece,) = read_points(tmp_path / "p.csv", 2)
+    (piece,) = read_points(tmp_path / "p.csv", ("x", "y"))
     np.testing.assert_array_equal(piece, [[0.25, -0.5]])
 
 
@@ -43,7 +43,7 @@ def test_columns_of_which_only_some_are_named_like_coordinates_are_not_guessed(t
     (tmp_path / "p.csv").write_text(f"{header}\n{','.join('1' for _ in header.split(','))}\n")
     names = header.replace(",", ", ")
     with pytest.raises(FileFormatError, match=f"has columns named {names}; valid: each of x, y once, or none of them"):
-        list(read_points(tmp_path / "p.csv", 2))
+        list(read_points(tmp_path / "p.csv", ("x", "y")))
 
 
 def test_columns_are_found_by_name_in_every_kind_of_file(tmp_path):
@@ -52,30 +52,30 @@ def test_columns_are_found_by_name_in_every_kind_of_file(tmp_path):
         file = tmp_path / f"t{suffix}"
         with table_writer(file, {"q": ["B", "note #1", "A"]}, 7) as write:
             write({"q": values})
-        (piece,) = read_points(file, 2, ("a", "b"))
+        (piece,) = read_points(file, ("a", "b"))
         np.testing.assert_array_equal(piece, values[:, [2, 0]])
         with pytest.raises(FileFormatError, match="has columns named B, note #1, A; valid: each of a, c once"):
-            list(read_points(file, 2, ("a", "c")))
+            list(read_points(file, ("a", "c")))
 
 
 @pytest.mark.parametrize("first", ["0.1,O.2", "0.1,NA", "a,0.2", "0.1,"])
 def test_a_first_row_with_a_bad_value_is_no_header(tmp_path, first):
     (tmp_path / "p.csv").write_text(f"{first}\n0.3,0.4\n")
     with pytest.raises(FileFormatError, match="row 1 holds"):
-        list(read_points(tmp_path / "p.csv", 2))
+        list(read_points(tmp_path / "p.csv", ("x", "y")))
 
 
 def test_a_parquet_file_whose_columns_share_a_name_is_refused(tmp_path):
     columns = [pyarrow.array([0.1, 0.2]), pyarrow.array([0.3, 0.4])]
     parquet.write_table(pyarrow.Table.from_arrays(columns, names=["a", "a"]), tmp_path / "p.parquet")
     with pytest.raises(FileFormatError, match="has columns named a, a; valid: names that differ"):
-        list(read_points(tmp_path / "p.parquet", 2))
+        list(read_points(tmp_path / "p.parquet", ("x", "y")))
 
 
 def test_what_is_wrong_is_said_wherever_in_a_long_file_it_is(tmp_path):
     (tmp_path / "p.csv").write_text("x,y\n" + "0.123456,0.654321\n" * 200_000 + "# two more\n1,2\n3,\n")
     with pytest.raises(FileFormatError, match="row 200002 holds NaN, infinite or missing"):
-        list(read_points(tmp_path / "p.csv", 2))
+        list(read_points(tmp_path / "p.csv", ("x", "y")))
 
 
 def test_seeds_are_read_as_points_are(tmp_path):
@@ -105,7 +105,7 @@ def test_seeds_are_read_as_points_are(tmp_path):
 def test_what_is_no_array_is_a_clear_error(tmp_path, content):
     (tmp_path / "p.npy").write_bytes(content)
     with pytest.raises(FileFormatError, match="is not a table of numbers: .|holds several arrays"):
-        list(read_points(tmp_path / "p.npy", 2))
+        list(read_points(tmp_path / "p.npy", ("x", "y")))
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npy", ".parquet"])
@@ -117,7 +117,7 @@ def test_tables_read_back_what_was_written_in_any_pieces(tmp_path, suffix):
     with table_writer(file, {"points": ["x", "y", "z"], "status": ["a, b"]}, len(values)) as write:
         for part in np.split(values, cuts):
             write({"points": part, "status": np.full(len(part), "too far")})
-    pieces = list(read_points(file, 3))
+    pieces = list(read_points(file, ("x", "y", "z")))
     assert len(pieces) > 1
     np.testing.assert_array_equal(np.concatenate(pieces), values)
 
@@ -170,7 +170,7 @@ def test_a_joint_named_like_a_coordinate_gets_a_column_of_its_own():
 
 def test_points_of_a_file_must_be_there(tmp_path):
     with pytest.raises(FileFormatError, match="does not exist"):
-        next(read_points(tmp_path / "p.csv", 2))
+        next(read_points(tmp_path / "p.csv", ("x", "y")))
 
 
 @pytest.mark.parametrize("terminal", [True, False])

@@ -9,6 +9,7 @@ import pytest
 import torch
 from pyarrow import parquet
 
+from grr_torch import Axis, Pose, Position, Yaw
 from grr_torch.applications.example_paths import KINDS, example_path, middles
 from grr_torch.applications.replay import read_waypoints, replay
 from grr_torch.applications.teleoperate import Teleoperator
@@ -269,9 +270,22 @@ def test_waypoints_are_read_from_tables(tmp_path):
     (tmp_path / "a.csv").write_text("x,y\n0.1,0.2\n0.3,0.4\n\n0.3,0.4\n")
     np.save(tmp_path / "c.npy", table)
     for name in ("a.csv", "c.npy"):
-        assert np.array_equal(read_waypoints(tmp_path / name, 2).numpy(), table)
+        assert np.array_equal(read_waypoints(tmp_path / name, Position(2)).numpy(), table)
     with pytest.raises(FileFormatError, match="has columns named x, y; valid: each of x, y, z once"):
-        read_waypoints(tmp_path / "a.csv", 3)
+        read_waypoints(tmp_path / "a.csv", Position(3))
+
+
+@pytest.mark.parametrize("task", [Pose(2), Pose(3), Yaw(3), Axis(3)], ids=lambda task: f"{task.kind} {task.width}")
+def test_waypoints_of_turning_tools_are_read_from_tables(tmp_path, task):
+    table = np.arange(1.0, 1.0 + 3 * task.width).reshape(3, task.width)
+    names = list(task.coordinates)
+    header = ",".join(reversed(names))
+    np.savetxt(tmp_path / "named.csv", table[:, ::-1], delimiter=",", header=header, comments="")
+    np.savetxt(tmp_path / "plain.csv", table, delimiter=",")
+    np.save(tmp_path / "p.npy", table)
+    for name in ("named.csv", "plain.csv", "p.npy"):
+        assert np.array_equal(read_waypoints(tmp_path / name, task).numpy(), table)
+    assert len(set(names)) == task.width
 
 
 @pytest.mark.parametrize("stop", [Session.let_go, Session.reset, Session.engage])

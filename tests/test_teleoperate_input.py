@@ -112,11 +112,22 @@ def test_after_the_clutch_it_starts_where_the_arm_is(roadmap):
         ({"timeout": -1.0}, "timeout"),
         ({"start": torch.zeros(6)}, "shape"),
         ({"start": torch.full((7,), float("nan"))}, "finite"),
+        ({"start": torch.tensor([0.0, 30.0, 0.0, -60.0, 0.0, 30.0, 0.0])}, "beyond its limits; valid: radians"),
     ],
 )
 def test_bad_parameters_are_refused(roadmap, arguments, what):
     with pytest.raises(ParameterError, match=what):
         Teleoperator(roadmap, **arguments)
+
+
+def test_what_is_no_roadmap_is_refused():
+    with pytest.raises(ParameterError, match=r"roadmap: got 'kinova.grr'; valid: a Roadmap, such as"):
+        Teleoperator("kinova.grr")
+
+
+def test_a_first_target_that_is_not_valid_is_refused_where_nobody_knows_where_the_arm_is(roadmap):
+    with pytest.raises(ParameterError, match="first target: got NaN"):
+        Teleoperator(roadmap).step(torch.full((3,), math.nan))
 
 
 @pytest.mark.parametrize("target", [torch.zeros(2), torch.zeros(5, 3), [0.1, 0.2, 0.3], torch.tensor(0.5)])

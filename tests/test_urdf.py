@@ -126,6 +126,15 @@ def test_a_margin_without_spheres_is_warned_of(load):
         load(robot_text(hinge("j", "a", "b")), margin=0.01)
 
 
+@pytest.mark.parametrize(("x", "warned"), [("340", True), ("-21", True), ("12", False)])
+def test_origins_that_are_likely_to_be_in_millimetres_are_warned_of(load, x, warned):
+    joint = hinge("j", "a", "b", "revolute", f'<origin xyz="0 {x} 0"/><limit lower="-1" upper="1" velocity="2"/>')
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load(robot_text(joint))
+    assert any("millimetres? (j)" in str(warning.message) for warning in caught) == warned
+
+
 @pytest.mark.parametrize(
     ("kind", "limit", "complaint"),
     [

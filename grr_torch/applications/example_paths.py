@@ -95,7 +95,8 @@ def example_path(roadmap: Roadmap, kind: str, rate: float = 50.0) -> Tensor:
             count = max(8, round(length / _SPEED * rate)) + 1
             busiest = _busiest(roadmap, draw(count)[fits[0]]) * rate
             return draw(round(count * max(1.0, busiest / _SHARE)))[fits[0]]
-    raise ParameterError("path", kind, "one that fits into the roadmap; this roadmap is too small for it")
+    valid = "one that leads through certified cells only; that takes a roadmap of more points, or a file of waypoints"
+    raise ParameterError("path", kind, valid)
 
 
 def _busiest(roadmap: Roadmap, path: Tensor) -> float:

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from grr_torch.errors import ParameterError
 from grr_torch.projection.columns import transposed_product
 from grr_torch.robots.curvature import force_derivative
 from grr_torch.robots.robot import Robot
@@ -169,16 +169,39 @@ class MovedBy(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, averages: Tensor, targets: Tensor, manifolds: Manifolds, nearest: Nearest) -> Tensor:
         """Gives the configurations as they are."""
-        ctx.manifolds, ctx.width = manifolds, len(targets)
-        ctx.save_for_backward(*nearest)
+        ctx.manifolds = manifolds
+        ctx.save_for_backward(averages, targets, *nearest)
         return nearest.q.clone()
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None, None]:
         """Solves the transposed conditions, one system a configuration."""
-        on_averages, on_pose = ctx.manifolds.moved(Nearest(*ctx.saved_tensors), gradient)
-        return on_averages, on_pose[: ctx.width], None, None
+        averages, targets, *nearest = ctx.saved_tensors
+        with torch.no_grad():
+            on_averages, on_pose = ctx.manifolds.moved(Nearest(*nearest), gradient)
+        # they depend on the inputs in a way that is not followed
+        return *_Once.apply(averages, targets, on_averages, on_pose[: len(targets)]), None, None  # type: ignore[no-untyped-call]
+
+
+class _Once(torch.autograd.Function):
+    """Derivatives that depend on averages and targets, but cannot be differentiated by them.
+
+    `once_differentiable` would let a second derivative pass over them in silence: it does not tell of what they depend.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, averages: Tensor, targets: Tensor, *derivatives: Tensor) -> tuple[Tensor, ...]:
+        """Gives the derivatives."""
+        return tuple(derivative.clone() for derivative in derivatives)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        """Refuses.
+
+        Raises:
+            ParameterError: Always.
+        """
+        raise ParameterError("order of the derivative", 2, "1: the map can be differentiated once")
 
 
 def _is_minimum(matrix: Tensor, held: Tensor) -> Tensor:

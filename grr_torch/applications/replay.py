@@ -14,20 +14,21 @@ from grr_torch.applications.teleoperate import Teleoperator
 from grr_torch.applications.teleoperation_log import Step, TeleoperationLog, tool_and_clearance
 from grr_torch.errors import ParameterError
 from grr_torch.progress import Progress, silent
+from grr_torch.spaces.task import TaskSpace
 from grr_torch.tables import read_points
 
 # after the last waypoint an arm has so long to arrive [s], and has arrived when its tool is so near [m]
 _MORE_SECONDS, _ARRIVED = 2.0, 1e-3
 
 
-def read_waypoints(path: str | os.PathLike[str], width: int) -> Tensor:
-    """Waypoints (N, width), one a row of a .csv, with or without a header, .npy or .parquet.
+def read_waypoints(path: str | os.PathLike[str], task: TaskSpace) -> Tensor:
+    """Waypoints (N, width) of a task, one a row of a .csv, with or without a header, .npy or .parquet.
 
     Raises:
         ParameterError: The suffix is not known.
         FileFormatError: It is missing, no such table, of another width, or has values that are not finite.
     """
-    return torch.from_numpy(np.concatenate(list(read_points(Path(path), width))))
+    return torch.from_numpy(np.concatenate(list(read_points(Path(path), task.coordinates))))
 
 
 def replay(teleoperator: Teleoperator, waypoints: Tensor, *, progress: Progress = silent) -> TeleoperationLog:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,12 +19,10 @@ from grr_torch.applications.retime import per_joint, usual_speeds
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import LAST_VALID
 from grr_torch.applications.steps import HOLDING, STATUSES
-from grr_torch.errors import ParameterError
+from grr_torch.errors import ParameterError, check_kind
 from grr_torch.pieces import Array, Mask, norms, one_thread
 from grr_torch.projection.project import Tolerances
-
-if TYPE_CHECKING:
-    from grr_torch.resolution.roadmap import Roadmap
+from grr_torch.resolution.roadmap import Roadmap
 
 # of projections along lines, whose guesses are near; what takes longer is not to be gone to in a control step
 _ITERATIONS = 6
@@ -32,6 +30,8 @@ _ITERATIONS = 6
 _DRIFT = 0.03
 # control steps a second [Hz]
 FASTEST = 1e4
+# an arm no farther than this beyond its limits [rad or m] may have been measured there
+_FARTHEST_OUTSIDE = 3.0
 # seconds that can be looked ahead
 _FARTHEST_AHEAD = 60.0
 
@@ -93,13 +93,14 @@ class Teleoperator:
                 target is, so it falls behind one that moves by what stopping takes.
             max_jump: A target farther from the last one than this [m] is refused, until `reset`; where rotation
                 varies, a radian counts as 0.3 m.
-            timeout: An input older than this [s] is refused; see `step`.
+            timeout: An input older than this [s] is refused, where `step` is told its `time`.
             foresight: For how long at most a target is taken to go on straight by an arm that cannot follow it, and
                 heads for where they will meet [s]; with 0, it heads for where the target is.
 
         Raises:
             ParameterError: A parameter is out of its range, no vertex is resolved, or the robot is not on the CPU.
         """
+        check_kind("roadmap", roadmap, Roadmap, "Roadmap.load(file)")
         robot = roadmap.robot
         if robot.device.type != "cpu":
             raise ParameterError("device of the robot", str(robot.device), "cpu, where few arms are fastest")
@@ -141,13 +142,16 @@ class Teleoperator:
                 commanded to, as fast as they are.
 
         Raises:
-            ParameterError: It is not finite, or its last axis is not n.
+            ParameterError: It is not finite, far beyond limits, or its last axis is not n.
         """
         robot = self.roadmap.robot
         if configuration is not None:
             q = robot.columns(configuration).detach().T
             if not bool(q.isfinite().all()):
                 raise ParameterError("configuration", "NaN or infinite values", "finite values")
+            if not bool(robot.within_limits(q, _FARTHEST_OUTSIDE).all()):
+                far = f"a joint more than {_FARTHEST_OUTSIDE:g} rad or m beyond its limits"
+                raise ParameterError("configuration", far, "radians and metres, as measured")
             self._batch, self._arms = configuration.shape[:-1], Arms.at(self._follower, q.numpy().copy())
         elif self._arms is not None:
             speed, self._arms = self._arms.speed, Arms.at(self._follower, self._arms.q)
@@ -172,7 +176,8 @@ class Teleoperator:
             The configurations to go to next, and what the arms are doing.
 
         Raises:
-            ParameterError: The shape is not that of the arms.
+            ParameterError: The shape is not that of the arms; or it is not known where they stand, and the first target
+                of one is not valid.
         """
         task, robot = self.roadmap.task, self.roadmap.robot
         if not isinstance(target, Tensor) or target.ndim == 0 or target.shape[-1] != task.width:
@@ -187,7 +192,8 @@ class Teleoperator:
             accepted = proper & self._in_time(time)
             if self._arms is None:
                 if not proper.all():
-                    raise ParameterError("first target", "NaN, infinite or zero", "valid points: the arms start there")
+                    valid = "valid points, where the arms start; or start or reset says where they are"
+                    raise ParameterError("first target", "NaN, infinite or zero", valid)
                 self._start(target.shape[:-1], targets)
             if self._last is not None:
                 # comparison with NaN, where there was no target yet, is false

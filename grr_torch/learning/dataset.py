@@ -14,6 +14,7 @@ from grr_torch.learning.encoding import Encoding
 from grr_torch.learning.sample import check_learnable, draw_samples
 from grr_torch.learning.split import SPLITS, Split
 from grr_torch.progress import Progress, silent
+from grr_torch.resolution.roadmap_file import roadmap_hash
 
 if TYPE_CHECKING:
     from grr_torch.resolution.roadmap import Roadmap
@@ -33,6 +34,7 @@ class RoadmapDataset(Dataset[tuple[Tensor, Tensor]]):
         split: (N,) uint8, indices into ("train", "validation", "test").
         inputs: (N, d) float32.
         targets: (N, width) float32.
+        roadmap_hash: SHA-256 of the roadmap's tensors.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class RoadmapDataset(Dataset[tuple[Tensor, Tensor]]):
             ParameterError: No vertex is resolved, no cell is certified, or a number is not valid.
         """
         check_learnable(roadmap)
+        self.roadmap_hash = roadmap_hash(roadmap)
         split = split or Split(seed=seed)
         if samples is None:
             if not bool(roadmap.resolved.any()):

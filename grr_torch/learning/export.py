@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,7 +43,7 @@ def check_dataset_path(name: str, path: Path) -> None:
 
 def export_dataset(
     roadmap: Roadmap,
-    out: Path,
+    out: str | os.PathLike[str],
     samples: int,
     *,
     split: Split | None = None,
@@ -79,6 +80,7 @@ def export_dataset(
         ParameterError: The suffix is not known, the number is not valid, or there are no certified cells.
         OutputError: It cannot be written.
     """
+    out = Path(out)
     check_dataset_path("out", out)
     check_learnable(roadmap)
     split = split or Split(seed=seed)

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from grr_torch.errors import ParameterError, check_seed, check_whole
+from grr_torch.errors import ParameterError, check_kind, check_seed, check_whole
 from grr_torch.learning.region import certified_region
 from grr_torch.learning.split import Split
 from grr_torch.progress import Progress, silent
+from grr_torch.resolution.roadmap import Roadmap
 from grr_torch.tables import PIECE
-
-if TYPE_CHECKING:
-    from grr_torch.resolution.roadmap import Roadmap
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +37,9 @@ def check_learnable(roadmap: Roadmap) -> None:
     """Checks that a network can be trained from a roadmap.
 
     Raises:
-        ParameterError: Rotation varies in its task.
+        ParameterError: It is none, or rotation varies in its task.
     """
+    check_kind("roadmap", roadmap, Roadmap, "Roadmap.load(file)")
     if roadmap.task.rotations is not None:
         raise ParameterError("task", roadmap.task.kind, "position or fixed-rotation: varying rotation is not learned")
 

@@ -55,6 +55,8 @@ class Split:
             raise ParameterError("validation and test shares", (self.validation, self.test), "less than 1 together")
         if self.block is not None and not 0.0 < self.block < math.inf:
             raise ParameterError("block", self.block, "above 0, in metres")
+        if self.block is not None and self.way != "region":
+            raise ParameterError("block", self.block, f"none for a split that is {self.way}")
         object.__setattr__(self, "seed", check_seed(self.seed))
 
     def of(self, roadmap: Roadmap) -> Splitter:

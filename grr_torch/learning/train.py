@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from grr_torch.errors import OutputError, ParameterError, TrainingError
+from grr_torch.errors import OutputError, ParameterError, TrainingError, check_kind
 from grr_torch.learning.checkpoint import Checkpoint, checkpoint_path
 from grr_torch.learning.dataset import RoadmapDataset
 from grr_torch.learning.loss import IkLoss, Loss
@@ -63,14 +63,15 @@ def train_ik(
         progress: Told how many points are solved.
 
     Raises:
-        ParameterError: The roadmap has too few resolved vertices or no certified cells, a part has no samples, or
-            `resume` without `out`.
+        ParameterError: The roadmap has too few resolved vertices or no certified cells, a part has no samples, the
+            dataset is of another roadmap, or `resume` without `out`.
         OutputError: `out` cannot be written, or the state of a training is there without `resume`.
         FileFormatError: The state to resume from is missing, or of another training.
         TrainingError: The loss is not finite.
     """
     check_learnable(roadmap)
     options = options or TrainingOptions()
+    check_kind("options", options, TrainingOptions, "TrainingOptions()")
     resolved = int(roadmap.resolved.sum())
     if resolved < _FEWEST_VERTICES:
         raise ParameterError("roadmap", f"one with {resolved} resolved vertices", f"{_FEWEST_VERTICES} or more")
@@ -78,7 +79,10 @@ def train_ik(
         raise ParameterError("resume", "no file", "the file that was to be written")
     if out is not None:
         check_weights_path("out", out)
-    identity = {"options": options.to_dict(), "origin": Origin.of(roadmap, {}).to_dict()}
+    origin = Origin.of(roadmap, {})
+    if dataset is not None and dataset.roadmap_hash != origin.roadmap_hash:
+        raise ParameterError("dataset", f"one of roadmap {dataset.roadmap_hash}", f"of this one, {origin.roadmap_hash}")
+    identity = {"options": options.to_dict(), "origin": origin.to_dict()}
     checkpoint = None if out is None else Checkpoint(checkpoint_path(out), identity)
     if checkpoint is not None and not resume and checkpoint.path.exists():
         valid = "another file to write; --resume to go on from there; or to remove it"

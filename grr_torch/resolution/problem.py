@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 
-from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError
+from grr_torch.errors import GrrWarning, ParameterError, UnknownNameError, check_kind
 from grr_torch.resolution.reachability import reach, reach_box, stays_in_plane, stays_upright, within_reach
 from grr_torch.resolution.seeds import SeedsLike
 from grr_torch.robots.presets import Problem as Preset
@@ -55,8 +55,7 @@ def pose_problem(
         UnknownNameError: No such task or seeds.
         ParameterError: Something is missing, does not fit the robot, or lies beyond its reach.
     """
-    if not isinstance(robot, Robot):
-        raise ParameterError("robot", repr(robot), "a Robot, such as load_robot('kinova') gives")
+    check_kind("robot", robot, Robot, "load_robot('kinova')")
     problem = _complete(robot, task, points, bounds, seeds, rotations)
     check_task(robot, problem.task)
     own_graph = isinstance(points, TaskGraph)
@@ -125,6 +124,8 @@ def check_task(robot: Robot, task: TaskSpace) -> None:
         ParameterError: The task takes more joints than there are, it is in SE(2) and the robot leaves the plane, or it
             is in space and the robot does not.
     """
+    check_kind("robot", robot, Robot, "load_robot('kinova')")
+    check_kind("task", task, TaskSpace, "Position(3)")
     given = f"{task.kind} in {task.name}"
     if task.dimension == 2 and task.constraints > 2 and not stays_upright(robot):
         raise ParameterError("task", given, f"SE(3) for {robot.name}, whose tool leaves the plane")

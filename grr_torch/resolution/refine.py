@@ -115,7 +115,8 @@ def _relaxed(
     cells = rank[roadmap.graph.triangles(roadmap.connected)].to(roadmap.robot.device)
     new = certify(network, cells, new, tolerances, progress, checkpoint).T
     configurations = roadmap.configurations.clone()
-    configurations[vertices] = new.cpu()
+    # files hold double precision, whatever the robot computes in
+    configurations[vertices] = new.cpu().to(configurations)
     return blended(roadmap, configurations, tolerances, check, progress, checkpoint.stage("edges-again"))
 
 

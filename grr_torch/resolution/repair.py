@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -82,19 +82,21 @@ def repair(
     return without_losses(roadmap, repaired, send_back, FlagCheck(tolerances, check, kept=checking))
 
 
-def _finished(roadmap: Roadmap, changed: Draft) -> Roadmap:
+def _finished(roadmap: Roadmap, draft: Draft) -> Roadmap:
+    """The roadmap with a draft's tensors, wherever these are."""
+    changed = Draft(**{name: tensor.cpu() for name, tensor in vars(draft).items()})
     reachable = None if roadmap.reachable is None else roadmap.reachable | changed.resolved
     return replace(roadmap, **vars(changed), resolved=changed.resolved, reachable=reachable)
 
 
 def _repaired(roadmap: Roadmap, setting: Setting, progress: Progress, kept: Stage) -> Roadmap:
     """The roadmap after all rounds, with edges as they were judged among few others."""
-    begin, names, device = 0, [field.name for field in fields(Draft)], roadmap.robot.device
-    given = {name: getattr(roadmap, name) for name in names}
+    begin, device = 0, roadmap.robot.device
+    draft = Draft(roadmap.configurations, roadmap.connected, torch.where(roadmap.resolved, roadmap.wave, -1))
     if state := kept.state():
         setting.generator.set_state(state["generator"])
-        begin, given = int(state["turn"]), {name: state[name] for name in names}
-    draft = Draft(**{name: tensor.to(device) for name, tensor in given.items()})
+        begin, draft = int(state["turn"]), Draft(*(state[name] for name in vars(draft)))
+    draft = Draft(**{name: tensor.to(device) for name, tensor in vars(draft).items()})
     for turn in range(begin, _ROUNDS):
         progress("repairing", turn, _ROUNDS)
         before = int(draft.connected.sum())
@@ -108,7 +110,7 @@ def _repaired(roadmap: Roadmap, setting: Setting, progress: Progress, kept: Stag
         if last:
             break
     progress("repairing", _ROUNDS, _ROUNDS)
-    return _finished(roadmap, Draft(**{name: tensor.cpu() for name, tensor in vars(draft).items()}))
+    return _finished(roadmap, draft)
 
 
 def _unresolved_at_the_rim(draft: Draft, setting: Setting) -> Tensor:
@@ -142,7 +144,7 @@ def _try(draft: Draft, candidates: Candidates, setting: Setting) -> _Trial:
     robot, task = setting.robot, setting.task
     rank, ends = setting.around(draft, candidates.vertices)
     vertices = candidates.vertices[rank]
-    configurations = candidates.configurations[rank], draft.configurations[ends]
+    configurations = candidates.configurations[rank], draft.configurations[ends].to(robot.dtype)
     points = setting.points[vertices], setting.points[ends]
     slopes = slopes_between(robot, task, *points, *configurations)
     worth = slopes <= setting.max_slope
@@ -181,7 +183,8 @@ def _take(draft: Draft, candidates: Candidates, trial: _Trial, chosen: Tensor) -
     """The map with the chosen candidates."""
     configurations, connected, wave = draft.configurations.clone(), draft.connected.clone(), draft.wave.clone()
     changed = candidates.vertices[chosen]
-    configurations[changed] = candidates.configurations[chosen]
+    # files hold double precision, whatever the robot computes in
+    configurations[changed] = candidates.configurations[chosen].to(configurations)
     wave[changed] = torch.where(wave[changed] < 0, wave.max() + 1, wave[changed])
     taken = torch.isin(trial.rank, chosen)
     connected[trial.edges[taken]] = trial.joined[taken]

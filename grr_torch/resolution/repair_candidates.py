@@ -24,7 +24,7 @@ _CHECKED = 3
 
 @dataclass(frozen=True)
 class Draft:
-    """What a repair changes of a roadmap, on the robot's device.
+    """What a repair changes of a roadmap.
 
     Attributes:
         configurations: (V, n).
@@ -74,7 +74,15 @@ class Setting:
 
     @staticmethod
     def of(roadmap: Roadmap, tolerances: Tolerances, seed: int, at_last: bool) -> Setting:
-        """As `repair` has it."""
+        """Of a roadmap.
+
+        Args:
+            roadmap: The roadmap.
+            tolerances: Of the projections.
+            seed: Of the random starts.
+            at_last: Whether edges of any slope are tried that is not left out, and starts beside configurations too;
+                else none that is ten times as steep as the median.
+        """
         device, bound = roadmap.robot.device, roadmap.parameters.get("max_slope")
         slopes, max_slope = edge_slopes(roadmap), torch.inf
         if len(slopes) and not at_last:
@@ -135,6 +143,7 @@ def find_candidates(draft: Draft, vertices: Tensor, starts: int, setting: Settin
 def _gentlest(draft: Draft, candidates: Candidates, setting: Setting) -> Candidates:
     """Of each vertex, the few candidates whose edges would be least steep: to check an edge costs far more."""
     count = len(candidates.vertices)
+    # not every device reduces no segments at all
     if count == 0:
         return candidates
     rank, ends = setting.around(draft, candidates.vertices)
@@ -149,6 +158,6 @@ def _gentlest(draft: Draft, candidates: Candidates, setting: Setting) -> Candida
 
 
 def sums(count: int, rank: Tensor, values: Tensor) -> Tensor:
-    """(count,) sums of values by rank, which ascends, in one order whatever the device."""
+    """(count,) sums of values by rank, which ascends, in the same order every time."""
     counts = rank.bincount(minlength=count)
     return torch.segment_reduce(values.double(), "sum", lengths=counts, initial=0.0, unsafe=True)

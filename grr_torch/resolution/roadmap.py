@@ -192,7 +192,7 @@ class Roadmap:
 
         Args:
             points: (*batch, width) points [m]; one or a million.
-            differentiable: Whether gradients flow from configurations to points, once.
+            differentiable: Whether gradients flow from configurations to points, once; torch.func cannot.
             progress: Told how many are solved.
 
         Returns:

@@ -108,8 +108,8 @@ def place_seeds(
     solved, valid = project_columns(robot, task, targets.T.contiguous(), guesses.T.contiguous(), tolerances)
     valid = valid.reshape(len(seeds), tried)
     wrong = {
-        "in self-collision": robot.in_self_collision(seeds),
         "outside joint limits": ~robot.within_limits(seeds),
+        "in self-collision": robot.in_self_collision(seeds),
     }
     usable = valid.any(1) & ~torch.stack(list(wrong.values())).any(0)
     _report(usable, wrong, warn)

@@ -18,6 +18,8 @@ from grr_torch.robots.urdf import MOVABLE_TYPES, Joint, Shape, Urdf
 
 # metres beyond which an origin is a mistake
 _FARTHEST = 1e6
+# metres beyond which origins are likely to be millimetres
+_FAR_AWAY = 20.0
 # radians beyond which limits are likely to be degrees
 _FARTHEST_TURN = 4.0 * math.pi
 _LIMITED_TYPES = ("revolute", "prismatic")
@@ -160,7 +162,9 @@ def _warn_of_limits(joints: Sequence[Any], source: str) -> None:
         if any(_FARTHEST_TURN < abs(bound or 0.0) < math.inf for bound in (joint.limit.lower, joint.limit.upper))
     ]
     still = [joint for joint in joints if joint.type in MOVABLE_TYPES and joint.limit and joint.limit.velocity == 0.0]
+    away = [joint for joint in joints if joint.origin is not None and np.abs(joint.origin[:3, 3]).max() > _FAR_AWAY]
     for found, text in (
+        (away, f"more than {_FAR_AWAY:g} m away from the link before: is its origin in millimetres?"),
         (far, "position limits beyond ±4π rad: are they in degrees?"),
         (unwritten, "no position limits (lower, upper): taken as unlimited, though URDF's default is 0 to 0"),
         (still, "a velocity limit of 0: taken as none"),
