@@ -29,13 +29,15 @@ def catalogue(
     """
     from grr_torch.errors import ParameterError
     from grr_torch.fleet.catalogue import best as best_rows
-    from grr_torch.fleet.catalogue import write_catalogue
+    from grr_torch.fleet.catalogue import read_catalogue, write_catalogue
 
     if per and best is None:
         raise ParameterError("--per", ", ".join(per), "none without --best")
-    rows = write_catalogue(folder)
-    if best is not None:
-        rows = best_rows(rows, best, per or [])
+    every = read_catalogue(folder)
+    rows = every if best is None else best_rows(every, best, per or [])
+    if not every:
+        raise ParameterError("DIR", folder, "a folder of `grr-torch sweep`, with roadmaps of it or failures")
+    write_catalogue(folder)
     if as_json:
         print_json({"roadmaps": rows})
         return

@@ -58,6 +58,7 @@ def test_the_commands_say_what_they_did(tmp_path):
         ("catalogue none", "none: is not a folder"),
         ("catalogue . --best smothness", "Did you mean 'smoothness'?"),
         ("catalogue . --per task", "none without --best"),
+        ("catalogue .", "DIR: got .; valid: a folder of `grr-torch sweep`"),
     ],
 )
 def test_a_mistake_ends_with_exit_code_2(tmp_path, monkeypatch, words, complaint):
@@ -67,6 +68,7 @@ def test_a_mistake_ends_with_exit_code_2(tmp_path, monkeypatch, words, complaint
     assert result.exit_code == 2
     assert complaint in result.stderr
     assert result.stdout == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["s.yaml"]
 
 
 @pytest.mark.parametrize("command", [["sweep"], ["catalogue"], ["bench", "cluster"]])
