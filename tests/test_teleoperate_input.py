@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from teleoperated import some_vertices
 
 import grr_torch
 from grr_torch.applications.teleoperate import Teleoperator
-from grr_torch.errors import ParameterError
+from grr_torch.errors import GrrWarning, ParameterError
 
 
 @pytest.fixture(scope="module")
@@ -112,12 +113,22 @@ def test_after_the_clutch_it_starts_where_the_arm_is(roadmap):
         ({"timeout": -1.0}, "timeout"),
         ({"start": torch.zeros(6)}, "shape"),
         ({"start": torch.full((7,), float("nan"))}, "finite"),
-        ({"start": torch.tensor([0.0, 30.0, 0.0, -60.0, 0.0, 30.0, 0.0])}, "beyond its limits; valid: radians"),
     ],
 )
 def test_bad_parameters_are_refused(roadmap, arguments, what):
     with pytest.raises(ParameterError, match=what):
         Teleoperator(roadmap, **arguments)
+
+
+def test_a_start_that_is_likely_to_be_in_degrees_is_warned_of_and_goes_back_all_the_same(roadmap):
+    degrees = torch.tensor([0.0, 30.0, 0.0, -60.0, 0.0, 30.0, 0.0], dtype=torch.float64)
+    with pytest.warns(GrrWarning, match="beyond its limits: is it in degrees"):
+        teleoperator = Teleoperator(roadmap, start=degrees)
+    moved = teleoperator.step(roadmap.points[some_vertices(roadmap, 1)[0]]).configuration
+    assert float((moved - degrees).abs().max()) <= float(roadmap.robot.velocity_limits.max()) / 50.0 + 1e-9
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Teleoperator(roadmap, start=torch.deg2rad(degrees))
 
 
 def test_what_is_no_roadmap_is_refused():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +20,7 @@ from grr_torch.applications.retime import per_joint, usual_speeds
 from grr_torch.applications.routes import Routes
 from grr_torch.applications.solve import LAST_VALID
 from grr_torch.applications.steps import HOLDING, STATUSES
-from grr_torch.errors import ParameterError, check_kind
+from grr_torch.errors import GrrWarning, ParameterError, check_kind
 from grr_torch.pieces import Array, Mask, norms, one_thread
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution.roadmap import Roadmap
@@ -30,7 +31,7 @@ _ITERATIONS = 6
 _DRIFT = 0.03
 # control steps a second [Hz]
 FASTEST = 1e4
-# an arm no farther than this beyond its limits [rad or m] may have been measured there
+# radians or metres beyond limits from which on a configuration is likely to be in other units
 _FARTHEST_OUTSIDE = 3.0
 # seconds that can be looked ahead
 _FARTHEST_AHEAD = 60.0
@@ -142,7 +143,7 @@ class Teleoperator:
                 commanded to, as fast as they are.
 
         Raises:
-            ParameterError: It is not finite, far beyond limits, or its last axis is not n.
+            ParameterError: It is not finite, or its last axis is not n.
         """
         robot = self.roadmap.robot
         if configuration is not None:
@@ -150,8 +151,8 @@ class Teleoperator:
             if not bool(q.isfinite().all()):
                 raise ParameterError("configuration", "NaN or infinite values", "finite values")
             if not bool(robot.within_limits(q, _FARTHEST_OUTSIDE).all()):
-                far = f"a joint more than {_FARTHEST_OUTSIDE:g} rad or m beyond its limits"
-                raise ParameterError("configuration", far, "radians and metres, as measured")
+                far = f"a joint is more than {_FARTHEST_OUTSIDE:g} rad or m beyond its limits: is it in degrees?"
+                warnings.warn(f"configuration: {far}", GrrWarning, stacklevel=2)
             self._batch, self._arms = configuration.shape[:-1], Arms.at(self._follower, q.numpy().copy())
         elif self._arms is not None:
             speed, self._arms = self._arms.speed, Arms.at(self._follower, self._arms.q)
