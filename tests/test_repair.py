@@ -12,7 +12,7 @@ import grr_torch
 from grr_torch.projection.project import Tolerances
 from grr_torch.resolution import auto_seeds, checkpoint
 from grr_torch.resolution.repair import _choose, _Trial
-from grr_torch.resolution.repair_candidates import Candidates, Draft, Setting
+from grr_torch.resolution.repair_candidates import Candidates, Draft, Setting, _gentlest
 from grr_torch.resolution.slopes import edge_slopes
 
 
@@ -69,6 +69,19 @@ def test_the_cheapest_is_taken_of_equal_ones_the_first_and_none_that_loses_or_ga
     assert chosen(broken, [30, 30, 30], [1.2, 1.1, 1.1]) == [1]
     assert chosen(broken, [30, 30], [1.2, 0.1], lost=1) == [0]
     assert chosen(replace(broken, connected=whole.connected), [30], [0.1]) == []
+
+
+def test_of_each_vertex_the_candidates_with_the_least_steep_edges_are_checked(whole, generator):
+    vertices = torch.tensor([20] * 5 + [30] * 2 + [40] * 6)
+    away = torch.rand(len(vertices), 1, dtype=torch.float64, generator=generator)
+    candidates = Candidates(vertices, whole.configurations[vertices] + away)
+    setting = Setting.of(whole, Tolerances(), 0, at_last=False)
+    kept = _gentlest(Draft(whole.configurations, whole.connected, whole.wave), candidates, setting)
+    assert kept.vertices.tolist() == [20] * 3 + [30] * 2 + [40] * 3
+    for vertex in (20, 30, 40):
+        nearest = away[vertices == vertex].sort(dim=0).values[:3]
+        found = kept.configurations[kept.vertices == vertex] - whole.configurations[vertex]
+        torch.testing.assert_close(found[:, :1].sort(dim=0).values, nearest)
 
 
 @pytest.mark.parametrize("max_slope", [14.8, None])
