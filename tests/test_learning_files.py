@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from safetensors.numpy import load_file
 
 import grr_torch
 from grr_torch import Split, TrainingOptions
-from grr_torch.errors import GrrError, MissingPackageError
+from grr_torch.errors import GrrError, GrrWarning, MissingPackageError
 from grr_torch.experiments.learning import compare_warm_starts, independent_solutions, measure_learning
 from grr_torch.learning.export import export_dataset
 from grr_torch.learning.network import Architecture
@@ -133,6 +134,14 @@ def test_an_export_that_is_stopped_leaves_nothing(planar_roadmap, tmp_path, suff
     with pytest.raises(error):
         export_dataset(planar_roadmap, out, ROWS, progress=stop)
     assert out.read_bytes() == b"before"
+
+
+def test_parts_without_samples_are_warned_of(planar_roadmap, tmp_path):
+    with pytest.warns(GrrWarning, match="none of 300 samples is for validation or test: take more, or smaller blocks"):
+        export_dataset(planar_roadmap, str(tmp_path / "d.npz"), 300, split=Split(block=100.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        export_dataset(planar_roadmap, tmp_path / "d.npz", 300, split=Split("random", test=0.0))
 
 
 def test_an_export_that_is_asked_to_end_leaves_nothing(planar_roadmap, tmp_path):

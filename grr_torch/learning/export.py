@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grr_torch.errors import ParameterError
+from grr_torch.errors import GrrWarning, ParameterError
 from grr_torch.learning.sample import check_learnable, draw_samples
 from grr_torch.learning.split import SPLITS, Split
 from grr_torch.output import atomic_write, check_writable
@@ -115,6 +116,10 @@ def export_dataset(
             for part, number in zip(SPLITS, np.bincount(arrays["split"], minlength=len(SPLITS)), strict=True):
                 counts[part] += int(number)
             counts["not valid"] += int((~piece.valid).sum())
+    empty = [part for part in ("validation", "test") if counts[part] == 0 and getattr(split, part) > 0.0]
+    if empty:
+        told = f"none of {samples:,} samples is for {' or '.join(empty)}: take more, or smaller blocks"
+        warnings.warn(told, GrrWarning, stacklevel=2)
     return counts
 
 
