@@ -20,7 +20,6 @@ from grr_torch.table_readers import read_npy, read_parquet, read_text
 
 # rows of a piece
 PIECE = 1 << 14
-AXES = ("x", "y", "z")
 _READS = (".csv", ".npy", ".parquet")
 _WRITES = (".csv", ".npy", ".npz", ".parquet")
 

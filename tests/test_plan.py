@@ -233,9 +233,8 @@ def test_ends_that_do_not_serve_are_a_clear_answer(roadmap):
         assert roadmap.plan(point, goal_configuration=hit).reason == "the goal configuration is in self-collision"
     if bool(robot.upper.isfinite().any()):
         beyond = torch.where(robot.upper.isfinite(), robot.upper + 0.1, 0.0)
-        reason = roadmap.plan(start_configuration=beyond, goal=point).reason
-        limited = [name for name, end in zip(robot.joint_names, robot.upper.tolist(), strict=True) if end < torch.inf]
-        assert reason == f"the start configuration is beyond joint limits ({', '.join(limited)})"
+        limited = ", ".join(n for n, end in zip(robot.joint_names, robot.upper, strict=True) if end < math.inf)
+        assert roadmap.plan(start_configuration=beyond, goal=point).reason.endswith(f"beyond joint limits ({limited})")
 
 
 def test_edges_in_collision_are_gone_round(kinova_roadmap):

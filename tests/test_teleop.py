@@ -279,8 +279,7 @@ def test_waypoints_are_read_from_tables(tmp_path):
 def test_waypoints_of_turning_tools_are_read_from_tables(tmp_path, task):
     table = np.arange(1.0, 1.0 + 3 * task.width).reshape(3, task.width)
     names = list(task.coordinates)
-    header = ",".join(reversed(names))
-    np.savetxt(tmp_path / "named.csv", table[:, ::-1], delimiter=",", header=header, comments="")
+    np.savetxt(tmp_path / "named.csv", table[:, ::-1], delimiter=",", header=",".join(reversed(names)), comments="")
     np.savetxt(tmp_path / "plain.csv", table, delimiter=",")
     np.save(tmp_path / "p.npy", table)
     for name in ("named.csv", "plain.csv", "p.npy"):

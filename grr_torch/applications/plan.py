@@ -17,7 +17,6 @@ from grr_torch.errors import ParameterError
 from grr_torch.pieces import one_thread
 from grr_torch.projection.continuity import usual_bounds
 from grr_torch.projection.project import point_columns, tool_points
-from grr_torch.robots.few import LIMITS_SLACK
 from grr_torch.spaces.configuration import distance
 
 if TYPE_CHECKING:
@@ -95,7 +94,7 @@ class Planner:
         if not bool(q.isfinite().all()):
             raise ParameterError(f"{name} configuration", "NaN or infinite values", "finite values")
         if not bool(robot.within_limits(q)):
-            outside = (q < robot.lower - LIMITS_SLACK) | (q > robot.upper + LIMITS_SLACK)
+            outside = (q < robot.lower) | (q > robot.upper)
             joints = ", ".join(robot.joint_names[joint] for joint in outside[0].nonzero()[:, 0].tolist())
             return _Refusal(f"the {name} configuration is beyond joint limits ({joints})")
         if bool(robot.in_self_collision(q)):

@@ -11,7 +11,7 @@ from torch import Tensor
 from grr_torch.applications.components import joint_ranges, places
 from grr_torch.applications.sample_manifold import Sampler
 from grr_torch.applications.trace_curves import Curves, End, Tracer
-from grr_torch.errors import ParameterError, check_seed, check_whole
+from grr_torch.errors import ParameterError, check_kind, check_seed, check_whole
 from grr_torch.progress import Progress, silent
 from grr_torch.projection.continuity import is_continuous
 from grr_torch.projection.project import DEFAULT_TOLERANCES, Tolerances, point_columns, project, project_columns
@@ -157,6 +157,8 @@ def self_motion_manifold(
         ParameterError: The point is not one of the task, not finite, or not reached from any start; there is no joint
             to spare; `samples`, `step` or `seed` is out of its range.
     """
+    check_kind("robot", robot, Robot, "load_robot('kinova')")
+    check_kind("task", task, TaskSpace, "Position(3)")
     check_task(robot, task)
     dimension = robot.n - task.constraints
     if dimension < 1:

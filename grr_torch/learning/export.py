@@ -18,7 +18,7 @@ from grr_torch.learning.split import SPLITS, Split
 from grr_torch.output import atomic_write, check_writable
 from grr_torch.progress import Progress, silent
 from grr_torch.resolution.roadmap_file import roadmap_hash
-from grr_torch.tables import AXES, Array, table_writer, unique_names
+from grr_torch.tables import Array, table_writer, unique_names
 from grr_torch.tensor_file import stream_tensors
 from grr_torch.version import __version__
 
@@ -125,7 +125,7 @@ def export_dataset(
 
 def _columns(roadmap: Roadmap, jacobians: bool) -> dict[str, list[str]]:
     """Names of the columns by array."""
-    axes = list(AXES[: roadmap.task.width])
+    axes = list(roadmap.task.coordinates)
     joints = unique_names(roadmap.robot.joint_names, (*axes, "valid", "split"))
     columns = {"points": axes, "configurations": joints, "valid": ["valid"], "split": ["split"]}
     if jacobians:

@@ -124,8 +124,6 @@ def check_task(robot: Robot, task: TaskSpace) -> None:
         ParameterError: The task takes more joints than there are, it is in SE(2) and the robot leaves the plane, or it
             is in space and the robot does not.
     """
-    check_kind("robot", robot, Robot, "load_robot('kinova')")
-    check_kind("task", task, TaskSpace, "Position(3)")
     given = f"{task.kind} in {task.name}"
     if task.dimension == 2 and task.constraints > 2 and not stays_upright(robot):
         raise ParameterError("task", given, f"SE(3) for {robot.name}, whose tool leaves the plane")

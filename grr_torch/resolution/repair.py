@@ -67,7 +67,10 @@ def repair(
     """
     checkpoint = checkpoint or Checkpoint()
     repairing, checking = map(checkpoint.stage, ("repair", "edges-repaired"))
-    repaired = _repaired(roadmap, Setting.of(roadmap, tolerances, seed, at_last), progress, repairing)
+    # of what is resolved alone, whatever the waves of the others
+    before = Draft(roadmap.configurations, roadmap.connected, torch.where(roadmap.resolved, roadmap.wave, -1))
+    setting = Setting.of(roadmap, tolerances, seed, at_last)
+    repaired = _finished(roadmap, _repaired(before, setting, progress, repairing))
     if not bool(moved(roadmap, repaired).any()):
         return roadmap
     # what follows makes a check of all
@@ -76,7 +79,7 @@ def repair(
 
     def send_back(changed: Roadmap, back: Tensor) -> Roadmap:
         configurations, wave = changed.configurations.clone(), changed.wave.clone()
-        configurations[back], wave[back] = roadmap.configurations[back], roadmap.wave[back]
+        configurations[back], wave[back] = before.configurations[back], before.wave[back]
         return _finished(roadmap, Draft(configurations, changed.connected, wave))
 
     return without_losses(roadmap, repaired, send_back, FlagCheck(tolerances, check, kept=checking))
@@ -89,14 +92,13 @@ def _finished(roadmap: Roadmap, draft: Draft) -> Roadmap:
     return replace(roadmap, **vars(changed), resolved=changed.resolved, reachable=reachable)
 
 
-def _repaired(roadmap: Roadmap, setting: Setting, progress: Progress, kept: Stage) -> Roadmap:
-    """The roadmap after all rounds, with edges as they were judged among few others."""
-    begin, device = 0, roadmap.robot.device
-    draft = Draft(roadmap.configurations, roadmap.connected, torch.where(roadmap.resolved, roadmap.wave, -1))
+def _repaired(draft: Draft, setting: Setting, progress: Progress, kept: Stage) -> Draft:
+    """The draft after all rounds, on the robot's device, with edges as they were judged among few others."""
+    begin = 0
     if state := kept.state():
         setting.generator.set_state(state["generator"])
         begin, draft = int(state["turn"]), Draft(*(state[name] for name in vars(draft)))
-    draft = Draft(**{name: tensor.to(device) for name, tensor in vars(draft).items()})
+    draft = Draft(**{name: tensor.to(setting.robot.device) for name, tensor in vars(draft).items()})
     for turn in range(begin, _ROUNDS):
         progress("repairing", turn, _ROUNDS)
         before = int(draft.connected.sum())
@@ -110,7 +112,7 @@ def _repaired(roadmap: Roadmap, setting: Setting, progress: Progress, kept: Stag
         if last:
             break
     progress("repairing", _ROUNDS, _ROUNDS)
-    return _finished(roadmap, draft)
+    return draft
 
 
 def _unresolved_at_the_rim(draft: Draft, setting: Setting) -> Tensor:
