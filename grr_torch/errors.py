@@ -139,13 +139,13 @@ def check_kind(name: str, value: object, kind: type, origin: str) -> None:
         name: The parameter's.
         value: What was given.
         kind: The class.
-        origin: What gives one.
+        origin: An example of one.
 
     Raises:
         ParameterError: It is not.
     """
     if not isinstance(value, kind):
-        raise ParameterError(name, repr(value), f"a {kind.__name__}, such as {origin} gives")
+        raise ParameterError(name, repr(value), f"a {kind.__name__}, such as {origin}")
 
 
 class SeedError(GrrError):

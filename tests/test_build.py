@@ -256,3 +256,10 @@ def test_unknown_seeds_and_methods_are_errors(planar_5):
         grr_torch.build(planar_5, "position", seeds="abc")
     with pytest.raises(UnknownNameError, match="expansion, random"):
         grr_torch.build(planar_5, "position", method="abc")
+
+
+def test_what_is_no_robot_or_no_task_is_refused(planar_5):
+    with pytest.raises(ParameterError, match=r"robot: got 'kinova'; valid: a Robot, such as load_robot\('kinova'\)"):
+        grr_torch.build("kinova")
+    with pytest.raises(ParameterError, match=r"task: got 'position'; valid: a TaskSpace, such as Position\(3\)"):
+        grr_torch.self_motion_manifold(planar_5, "position", [0.3, 0.1])
